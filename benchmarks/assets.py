@@ -144,7 +144,8 @@ def judge(
         lights: Environment files.
         folder: A folder for what processes hand over.
         edge: Pixels along an edge.
-        samples: Of Mitsuba's two pictures, which have independent noise, at least; up to `BLOCKS` times as many.
+        samples: Smallest number of samples of a pixel in each of Mitsuba's two pictures, which have independent noise.
+            Up to `BLOCKS` times as many are taken.
         model: One of `asset_scenes.MODELS`.
         warm: Whether compiled programs may be there.
         limit: Seconds of the clock for each process.
@@ -312,7 +313,7 @@ def relight(request: dict[str, Any]) -> dict[str, Any]:
 
 
 def _processor_seconds() -> float:
-    """Of all threads of this process."""
+    """Processor seconds of all threads of this process so far."""
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return usage.ru_utime + usage.ru_stime
 

@@ -55,7 +55,7 @@ def metallic_roughness(textures: dict[str, Any]) -> Any:
 
     Args:
         textures: By the names of `jaxprt.brdf.MetallicRoughness`, with `f0` in place of `ior` and `specular_color`.
-            Its shape needs the attribute `TANGENT`.
+            The shape then needs the attribute `TANGENT`.
     """
     return _metallic_roughness()(textures)
 

@@ -74,10 +74,10 @@ def parse(text: str) -> Callable | TexturedMaterial:
 
 
 def parameters(name: str) -> dict[str, float | None]:
-    """Parameters of a model with their defaults; None for required ones."""
+    """Numeric parameters of a model with their defaults; None for required ones."""
     result = {}
     for field in inspect.signature(MODELS[name]).parameters.values():
-        if not field.name.endswith("_texture"):
+        if not field.name.endswith("_texture") and not isinstance(field.default, str):
             result[field.name] = None if field.default is inspect.Parameter.empty else float(field.default)
     return result
 

@@ -132,36 +132,35 @@ def divided(
 def _stored(scene: Scene, folder: pathlib.Path | None, options: dict) -> MeshDivision:
     """The division of a scene, made once for a folder."""
     if folder is None:
-        return _made(scene, "", options)
+        return _division(scene, "", options)
     lights = [np.asarray(light.radiance) for light in options["environments"] or ()]
     cameras = [np.concatenate([np.ravel(value) for value in jax.tree.leaves(camera)]) for camera in scene.cameras]
     settings = np.asarray([options["error"], options["vertices"], refinement.ALGORITHM], np.float64)
-    key = blocks.fingerprint(*(np.asarray(each) for each in (*_geometry(scene), settings, *cameras, *lights)))
+    key = blocks.fingerprint(*_geometry(scene), settings, *cameras, *lights)
     with filelock.FileLock(folder / ".division.lock"):
         path = folder / "division"
         if path.exists():
-            found = objects.load(path)
-            if not isinstance(found, MeshDivision):
-                raise ValueError(f"{path} is damaged: it must hold a division, got a {type(found).__name__}")
-            if found.key != key:
+            division = objects.load(path)
+            if not isinstance(division, MeshDivision):
+                raise ValueError(f"{path} is damaged: it must hold a division, got a {type(division).__name__}")
+            if division.key != key:
                 raise ValueError(
                     f"{path} divides another scene, or for other cameras, lights, `refine` or `vertices`: name another "
                     "path or delete it"
                 )
-            return found
-        made = _made(scene, key, options)
-        objects.save(path, made)
-        return made
+            return division
+        division = _division(scene, key, options)
+        objects.save(path, division)
+        return division
 
 
 def _geometry(scene: Scene) -> list[np.ndarray]:
     mesh = scene.mesh
-    return [np.asarray(each) for each in (mesh.position, mesh.normal, mesh.face, mesh.region)] + [
-        np.asarray(each) for each in jax.tree.leaves(mesh.opacity)
-    ]
+    arrays = mesh.position, mesh.normal, mesh.face, mesh.region, *jax.tree.leaves(mesh.opacity)
+    return [np.asarray(array) for array in arrays]
 
 
-def _made(scene: Scene, key: str, options: dict) -> MeshDivision:
+def _division(scene: Scene, key: str, options: dict) -> MeshDivision:
     steps, error = _divisions(scene, **options)
     face, origin, parent = zip(*steps, strict=True) if steps else ((), (), ())
     counts = tuple(len(part.mesh.position) for part in scene.parts)

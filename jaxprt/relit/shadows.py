@@ -67,10 +67,10 @@ class TracedLight(eqx.Module):
         """The texels, what is taken out of them, and their shares at some points; an index of -1 is padding."""
         share = self.shares.share
         if known(share, index):  # The number of points depends on the view.
-            own = put(np.asarray(share)[:, np.maximum(index, 0)])
+            row = put(np.asarray(share)[:, np.maximum(index, 0)])
         else:
-            own = jnp.asarray(share)[:, jnp.maximum(index, 0)]
-        return self.shares.texel, self.excess, own
+            row = jnp.asarray(share)[:, jnp.maximum(index, 0)]
+        return self.shares.texel, self.excess, row
 
 
 def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, keep: bool) -> TracedLight | None:
@@ -101,7 +101,7 @@ def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, k
     direction = light_samples.in_texels(number[bright], fine, size=size, count=texel_rays.PLACES)
     share = np.zeros((len(number), len(pixels.triangle)), np.uint8)
     rays = texel_rays.TexelRays(direction, count)
-    share[bright] = _kept(mesh, pixels, width, number[bright], rays) if keep else _cast(mesh, pixels, width, rays)
+    share[bright] = _shares(mesh, pixels, width, number[bright], rays) if keep else _cast(mesh, pixels, width, rays)
     return TracedLight(rest, excess, TexelShares(texel, share))
 
 
@@ -138,7 +138,7 @@ _VIEWS: collections.OrderedDict[int, tuple[Any, dict]] = collections.OrderedDict
 _LOCK = threading.Lock()
 
 
-def _kept(
+def _shares(
     mesh: Mesh, pixels: Pixels, width: int, texel: Int[np.ndarray, " t"], rays: texel_rays.TexelRays
 ) -> UInt8[np.ndarray, "t p"]:
     """The shares of texels, of which only those are traced that were not traced before."""

@@ -187,6 +187,29 @@ class Blend(eqx.Module):
             )
 
 
+def albedo_view(
+    albedo: Float[Array, " c"], eye: Float[Array, "*p 3"], blend: Blend | None, *, vertices: int
+) -> Float[Array, "_ d"]:
+    """The view of an ideally diffuse system: the albedo of all vertices, or of each vertex with a blend.
+
+    Args:
+        albedo: Albedo of all vertices, gray or per color.
+        eye: Position of the viewer in world units, on which the view does not depend.
+        blend: Albedo of each vertex, as weights of one channel; None for `albedo`.
+        vertices: Number of vertices or points.
+
+    Raises:
+        TypeError: The blend is not a `Blend`.
+        ValueError: The eye is not finite, or the blend has another number of vertices or channels.
+    """
+    check_blend(blend)
+    require.position("the eye", eye, each=vertices)
+    if blend is None:
+        return albedo[None]
+    blend.check(vertices, 1)
+    return blend.weight[:, 0]
+
+
 def check_blend(value: Any) -> None:
     """Refuses materials that are neither None nor a `Blend`."""
     if value is not None:

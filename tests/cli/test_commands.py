@@ -8,13 +8,14 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import click
 import numpy as np
 import pytest
 
 import jaxprt as prt
-from jaxprt.cli import inputs, measure, planned, play, relight
+from jaxprt.cli import inputs, measure, options, planned, play, relight
 from jaxprt.cli import report as cli_report
 from jaxprt.cli.main import program
 from jaxprt.relit import measuring
@@ -244,3 +245,20 @@ def test_ctrl_c_ends_a_process_with_130_and_without_a_traceback(place):
 
 def test_only_relight_knows_its_systems():
     assert set(relight.SYSTEMS) == {"planned", "lobe", "harmonic", "separable", "clusters", "dynamic"}
+
+
+def test_meshes_are_divided_to_the_error_that_is_asked_for(place):
+    chosen = {"files": [place / "mesh.obj"], "outside": False, "up": "y", "ground": False, "brdf": None, "material": ()}
+    counts = [len(inputs.scene(SimpleNamespace(**chosen, refine=refine)).mesh.position) for refine in (False, 0.2, 0.1)]
+    assert counts[0] == 4 < counts[1] < counts[2]
+
+
+@pytest.mark.parametrize(("text", "value"), [("off", False), ("0.02", 0.02), ("0", 0.0)])
+def test_errors_of_divided_meshes_are_numbers_or_off(text, value):
+    assert options.Refinement().convert(text, None, None) == value
+
+
+@pytest.mark.parametrize("text", ["fine", "-1", "nan", "inf", ""])
+def test_other_errors_of_divided_meshes_are_refused(text):
+    with pytest.raises(click.UsageError, match="must be an error of at least 0"):
+        options.Refinement().convert(text, None, None)

@@ -142,12 +142,7 @@ class DiffuseSystem(protocol.VertexSystem):
 
     def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> Float[Array, "_ d"]:
         """Albedo of all vertices, or of each vertex with a blend. It does not depend on the eye."""
-        protocol.check_blend(materials)
-        require.position("the eye", eye, each=self.vertices)
-        if materials is None:
-            return self.albedo[None]
-        materials.check(self.vertices, 1)
-        return materials.weight[:, 0]
+        return protocol.albedo_view(self.albedo, eye, materials, vertices=self.vertices)
 
     @promoted
     def combine(self, light: Float[Array, "lm c"], view: Float[Array, "_ d"]) -> Float[Array, "v e"]:
