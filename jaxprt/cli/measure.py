@@ -105,6 +105,7 @@ def described(found: Report, lights: list[str]) -> dict[str, Any]:
         ],
         "pixel_error": errors(found.errors),
         "pixel_uncertainty": errors(found.uncertainty),
+        "interpolation_error": float(found.interpolation_error),
         "light_seconds": float(found.light_seconds),
         "view_seconds": float(found.view_seconds),
         "bytes": int(found.nbytes),

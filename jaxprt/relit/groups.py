@@ -27,9 +27,7 @@ from jaxprt.scene.points import Points
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart
 from jaxprt.systems.bounces.traced import SharpPart
 from jaxprt.systems.bright_texels import BrightTexels
-from jaxprt.systems.harmonic import DiffuseSystem
 from jaxprt.systems.lamps import LitByLamps
-from jaxprt.systems.lobe import MatteSystem
 from jaxprt.systems.protocol import Blend, System
 
 _FEWEST = 64  # vertices of a group
@@ -69,8 +67,7 @@ class Surface(eqx.Module):
     @property
     def matte(self) -> bool:
         """Whether the surface is ideally diffuse."""
-        own = self.system.system if isinstance(self.system, BrightTexels) else self.system
-        return isinstance(own, DiffuseSystem | MatteSystem)
+        return self.system.matte
 
     @property
     def channels(self) -> int:
@@ -280,11 +277,6 @@ class Stage(eqx.Module):
     def shift(self) -> Int[np.ndarray, " v"]:
         """Index of each vertex, minus its index in its group."""
         return self.place.shift[self.part]
-
-    @property
-    def matte(self) -> tuple[bool, ...]:
-        """Whether each group is ideally diffuse."""
-        return tuple(surface.matte for surface in self.surfaces)
 
     @property
     def sharp_groups(self) -> list[int]:

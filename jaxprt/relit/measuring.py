@@ -56,15 +56,15 @@ class Report(NamedTuple):
         uncertainty: Estimated relative L2 error of the reference pixels under each light.
         light_seconds: Time of a new light for all vertices on this machine.
         view_seconds: Time of a new view for all vertices on this machine.
-        between_vertices: Relative L2 error of pictures by visibility between vertices, which is interpolated except for
-            the brightest texels, as `jaxprt.refine` estimates it.
+        interpolation_error: Relative L2 error of pictures by visibility that is interpolated between vertices, as
+            `jaxprt.refine` estimates it.
         nbytes: Size of all transport and BRDFs in bytes.
     """
 
     part: tuple[PartReport, ...]
     errors: tuple[float, ...]
     uncertainty: tuple[float, ...]
-    between_vertices: float
+    interpolation_error: float
     light_seconds: float
     view_seconds: float
     nbytes: int
@@ -77,7 +77,7 @@ class Report(NamedTuple):
             for each in self.part
         ]
         rows.append(f"pictures off by {_percent(self.errors)}, measured to {_percent(self.uncertainty)}")
-        rows.append(f"visibility between vertices off by {_percent([self.between_vertices])}")
+        rows.append(f"visibility between vertices off by {_percent([self.interpolation_error])}")
         times = f"{1e3 * self.light_seconds:.1f} ms for a new light, {1e3 * self.view_seconds:.1f} ms for a new view"
         return "\n".join([*rows, f"in all: {self.nbytes / 1e6:.2f} MB, {times}"])
 

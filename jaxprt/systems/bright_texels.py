@@ -147,6 +147,11 @@ class BrightTexels(VertexSystem):
         )
 
     @property
+    def matte(self) -> bool:
+        """Whether the underlying system is ideally diffuse."""
+        return self.system.matte
+
+    @property
     def vertices(self) -> int:
         """Number of vertices, or of points where radiance is evaluated at points."""
         return self.system.vertices

@@ -108,6 +108,11 @@ class System(eqx.Module):
         """Number of vertices, or of points."""
 
     @property
+    def matte(self) -> bool:
+        """Whether surfaces are ideally diffuse: radiance is linear in the light that arrives at the vertices."""
+        return False
+
+    @property
     def shared_light(self) -> tuple | None:
         """Key of the result of `light`: systems with equal keys can share it. None if it cannot be shared."""
         return None

@@ -152,6 +152,11 @@ class DiffuseSystem(protocol.VertexSystem):
         return self.carried(combine(light, self.transport.vector)) * view
 
     @property
+    def matte(self) -> bool:
+        """True: surfaces are ideally diffuse."""
+        return True
+
+    @property
     def vertices(self) -> int:
         """Number of vertices, or of points where radiance is evaluated at points."""
         return len(self.transport.position if self.points is None else self.points)

@@ -98,6 +98,11 @@ class MatteSystem(protocol.VertexSystem):
         return diffuse.at_points(irradiance, light.flux, self.points).T * view
 
     @property
+    def matte(self) -> bool:
+        """True: surfaces are ideally diffuse."""
+        return True
+
+    @property
     def vertices(self) -> int:
         """Number of vertices, or of points where radiance is evaluated at points."""
         return len(self.transport.position if self.points is None else self.points)

@@ -21,7 +21,7 @@ COARSE = {"matte": 0.01, "glossy": 0.03, "sharp": 0.021, "brushed": 0.013}
 FURNACE = 0.0125  # Of all vertices together, measured .0083: pyramids and lookups blur the horizon.
 GRAZING = 0.085  # Of the worst vertex, measured .056.
 BLUR = 0.08  # Measured .077 at the finest scale that texels resolve: the lookup's tent is taken out of the blur.
-COVARIANCE = 0.3  # of the covariance; splines bring too much of it where an edge lies between two texels, as here
+COVARIANCE = 0.25  # Of the covariance, what splines bring too much where an edge lies between texels: measured .24.
 BRDFS = {
     "matte": CookTorrance(diffuse=[0.8, 0.5, 0.2], specular=0.0),  # Lambert, by programs that the next two share.
     "glossy": CookTorrance(diffuse=[0.0, 0.0, 0.0], roughness=0.3),
