@@ -19,9 +19,6 @@ from jaxtyping import Array, Float, Num
 
 from jaxprt.sphere import directions
 
-# Size of the footprint with which maps are read, relative to the pixel. A look-up in a mip map averages over a box of
-# the footprint's size, widened by a tent of twice that size: together they have three times the variance of the box.
-NARROWER = 3**-0.5
 _LOWEST = 0.1  # least ratio of a normal's height to its slope: lower normals are raised to it
 _FLAT = 1e-3  # Below this, slopes may be rounding errors: a normal without height is then that of the surface.
 

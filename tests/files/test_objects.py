@@ -23,9 +23,10 @@ from jaxprt.brdf import navigation
 from jaxprt.files import fields, mapped
 from jaxprt.sphere import hemisphere
 
-# Host records of the command line and of reports; they hold functions and file names.
+# Host records of the command line, of reports, of files that are read, and libraries; no user saves them.
 UNSAVED = {"jaxprt.cli.report", "jaxprt.cli.animation", "jaxprt.__main__", "jaxprt.view.piece", "jaxprt.view.messages"}
-UNSAVED |= {"jaxprt.scene.formats.geometry", "jaxprt.scene.formats.ply_table", "jaxprt.scene.formats.text"}
+UNSAVED |= {f"jaxprt.scene.formats.{name}" for name in ("geometry", "gltf_file", "gltf_geometry", "ply_table", "text")}
+UNSAVED |= {"jaxprt.visibility.packets"}
 
 
 def classes():

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxprt as prt
-from jaxprt.scene import Texture, TexturedMaterial, builtin, material_table, normal_maps, texture
+from jaxprt.scene import Texture, TexturedMaterial, builtin, material_table, texture
 from jaxprt.scene.mesh import make_mesh
 from jaxprt.scene.points import Points
 
@@ -80,7 +80,7 @@ def test_textures_are_averaged_over_the_pixel_of_a_point(close):
 
     def read(across, down):
         weight = np.stack([1 - place.sum(1), *place.T])
-        wide = np.array([[-sum(way), *way] for way in (across, down)]) / material_table._SHARPER
+        wide = np.array([[-sum(way), *way] for way in (across, down)]) / material_table.SHARPER
         slope = np.broadcast_to(wide[..., None], (2, 3, 3))
         points = Points(np.repeat([[0], [1], [2]], 3, 1).astype(np.int32), weight, slope.astype(np.float32))
         return table.at(points).values.base_color
@@ -112,7 +112,7 @@ def test_normals_of_a_map_are_averaged_over_a_pixel_and_their_spread_is_roughnes
         slope = np.float32([[[-width], [width], [0]], [[-width], [0], [width]]])
         return table.at(Points(np.int32([[0], [1], [2]]), weight, slope))
 
-    near, far = look(1e-3 / 16), look(2 / 16 / normal_maps.NARROWER)
+    near, far = look(1e-3 / 16), look(2 / 16 / material_table.SHARPER)
     close(near.normal, [[0.6, 0.8, 0.0]], tolerance=1e-4)
     close(near.values.roughness, [0.3], tolerance=1e-4)
     close(far.normal, [[0.0, 1.0, 0.0]], tolerance=1e-4)

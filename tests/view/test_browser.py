@@ -92,7 +92,7 @@ def hand(browser, server):
     assert not made.errors
 
 
-def drawn(hand, systems, lights):
+def drawn(hand, systems, lights, shadows="rays"):
     """The picture that Python draws of the state of a tab."""
     state, camera = hand.state(), hand.camera()
     scene = systems[state["system"]]
@@ -102,15 +102,18 @@ def drawn(hand, systems, lights):
     light = rotate(list(lights.values())[state["light"]], np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]))
     height, width = hand.pixels().shape[:2]
     view = Camera(camera["eye"], camera["target"], [0.0, 1.0, 0.0], camera["angle"], width, height)
-    return np.asarray(image.display(image.expose(scene.picture(light, view), stops=float(state["stops"]))))
+    return np.asarray(
+        image.display(image.expose(scene.picture(light, view, shadows=shadows), stops=float(state["stops"])))
+    )
 
 
 def test_the_canvas_shows_what_python_draws(hand, systems, lights):
     hand.page.keyboard.press("g")
     hand.page.locator("canvas.canvas").focus()
     hand.still()
-    expected = drawn(hand, systems, lights)
-    np.testing.assert_allclose(hand.pixels(), expected, atol=2.5 / 255)
+    off = np.abs(hand.pixels() - drawn(hand, systems, lights)).max(-1)
+    assert np.quantile(off, 0.99) < 2.5 / 255  # Rays of a few pixels pass an edge on the other side.
+    assert np.mean(off) < 0.5 / 255
 
 
 def test_while_it_moves_the_canvas_shows_radiance_of_vertices_within_antialiasing(hand, systems, lights):
@@ -120,7 +123,7 @@ def test_while_it_moves_the_canvas_shows_radiance_of_vertices_within_antialiasin
     hand.page.keyboard.press("]")
     hand.settle()
     time.sleep(0.3)
-    off = np.abs(hand.pixels() - drawn(hand, systems, lights)).max(-1)
+    off = np.abs(hand.pixels() - drawn(hand, systems, lights, shadows="vertices")).max(-1)
     assert np.quantile(off, 0.9) < 0.03
     assert np.mean(off) < 0.02
 
@@ -250,10 +253,13 @@ def test_a_dropped_file_is_the_light_and_another_one_says_what_is_wrong(hand, tm
     drop(hand, "red.exr", path.read_bytes())
     hand.page.wait_for_function(f"() => ({CANVAS}).state.light === 2")
     hand.settle()
-    time.sleep(0.3)
-    shown = hand.pixels()
-    assert shown[..., 0].mean() > 0.3
+    for _ in range(20):
+        time.sleep(0.3)
+        shown = hand.pixels()
+        if shown[..., 1:].max() < 0.02:
+            break
     assert shown[..., 1:].max() < 0.02
+    assert shown[..., 0].mean() > 0.3
     drop(hand, "poem.txt", b"roses are red")
     hand.page.wait_for_function(f"() => {TOLD}.includes('poem.txt')")
     assert hand.state()["light"] == 2
