@@ -60,7 +60,7 @@ class Family(eqx.Module):
     specular: Float[Array, "m 3"]
 
 
-def blinn_phong(*, exponents: Sequence[float] = range(1, 201)) -> Family:
+def blinn_phong(*, exponents: Sequence[int | float] = range(1, 201)) -> Family:
     """Family of Blinn-Phong lobes with their exponent as coordinate; by default the integers 1 to 200, as published.
 
     The lobes are normalized like `models.BlinnPhong`: each reflects all light at normal incidence. Weights are linear
