@@ -227,7 +227,11 @@ def _seen_part(visible, face, s, t, spread, concentration) -> tuple[Array, Array
     shift = jnp.minimum(shift, _FARTHEST)
     # Variance across an edge at a: 1 - m (m + a) with mean m = phi(a) / Phi(a), here as a fit over m.
     across = 1 / (1 + shift * (2 + 0.42 * shift))
-    face, s, t = cubemap.project(*cubemap.unproject(face, s + along_s * reach, t + along_t * reach))
+    # In the tangent plane of the lobe's direction: on the plane of the face, long steps would depend on the face.
+    by_s, by_t = along_s * reach, along_t * reach
+    inward = (s * by_s + t * by_t) / (1 + s**2 + t**2)
+    own, moved = cubemap.unproject(face, s, t), cubemap.unproject(face, s + by_s, t + by_t)
+    face, s, t = cubemap.project(*(x - inward * y for x, y in zip(moved, own, strict=True)))
     return seen, face, s, t, spread * (1 + across) / 2
 
 

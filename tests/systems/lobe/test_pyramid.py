@@ -11,6 +11,7 @@ from jaxprt.decompose import mixture
 from jaxprt.scene import builtin
 from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.sphere import cubemap
+from jaxprt.systems.lobe import relight
 
 SIZE = 16
 BYTE = 2e-3  # half a step of a byte
@@ -190,3 +191,23 @@ def test_tracing_gives_what_compressing_known_visibility_gives(visible, compress
 def test_other_sizes_are_refused(size):
     with pytest.raises(ValueError, match=rf"size must be a power of two, at least 8, got {size}"):
         lobe.precompute(builtin.sphere(rings=4, sectors=5), size=size)
+
+
+def test_the_mean_of_the_seen_part_does_not_depend_on_the_face_of_the_lobe():
+    """At an edge of the cube, where a long step on the planes of two faces ends at two places."""
+    place = [cubemap.project(*(jnp.asarray([x]) for x in way)) for way in ([0.6, 1.0, 0.99999], [0.6, 0.99999, 1.0])]
+    concentration = jnp.array([4.0])
+    slope, moved = np.array([0.3, -1.5, 1.2]), []
+    for face, s, t in place:
+        first, second, normal = cubemap.axes()[int(face[0])]
+        point = float(s[0]) * first + float(t[0]) * second + normal
+        # Derivatives by s and t of what has this gradient at the direction of the point.
+        tangent = slope - point * (slope @ point) / (point @ point)
+        by_s, by_t = (jnp.asarray([tangent @ each / np.linalg.norm(point)]) for each in (first, second))
+        visible = jnp.array([0.3]), by_s, by_t
+        seen = relight._seen_part(visible, face, s, t, mixture.drop(concentration), concentration)
+        way = np.array([float(x[0]) for x in cubemap.unproject(*seen[1:4])])
+        moved.append(way / np.linalg.norm(way))
+    start = np.array([0.6, 1, 1]) / np.linalg.norm([0.6, 1, 1])
+    assert moved[0] @ start < np.cos(0.5)
+    np.testing.assert_allclose(moved[0], moved[1], atol=1e-4)
