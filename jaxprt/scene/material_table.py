@@ -51,8 +51,9 @@ _SHINY = sum(width for _, width in _FACTORS)  # column that is 1 for `BlinnPhong
 _LAYERS = ("clearcoat", "clearcoat_roughness", "transmission")  # columns after it, in scenes that have them
 ROW = 1 << 12  # number of points that are evaluated together
 SMOOTHEST = 1e-3**0.5  # smaller roughness is treated as this one
-# Edge of what is averaged, in pixels: mip maps and interpolation within and between them average about as much again.
-# Against the mean over the pixel: 1 leaves 5.2, 3.5 and 2.2 % of three textures, this 2.9, 1.5 and 1.0 %.
+# Edge of what a look-up averages, in pixels: mip maps and interpolation within and between them average about as much
+# again. Against the mean over the pixel: 1 leaves 5.2, 3.5 and 2.2 % of three textures, this 2.9, 1.5 and 1.0 %. Probes
+# along a footprint are as far apart as the pixel is long.
 SHARPER = 0.64
 _LEVELS = 16  # of a mip map at most: images of up to 32,768 texels along an edge
 _PROBES = 4  # lookups along an elongated footprint
@@ -297,8 +298,7 @@ def _looked_up(
 ) -> Float[Array, "p 3"]:
     """Values of images at points that each read an image of their own, averaged over the pixel."""
     shape = texels.shape[image]
-    slope = SHARPER * slope
-    scaled = jax.lax.stop_gradient(slope) * shape[:, ::-1].astype(slope.dtype)
+    scaled = SHARPER * jax.lax.stop_gradient(slope) * shape[:, ::-1].astype(slope.dtype)
     length = jnp.sqrt(jnp.sum(scaled**2, -1))
     long, short = jnp.maximum(length[0], length[1]), jnp.minimum(length[0], length[1])
     along = jnp.where((length[0] > length[1])[:, None], slope[0], slope[1])

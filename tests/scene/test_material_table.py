@@ -69,7 +69,7 @@ def test_texels_are_kept_where_there_are_no_new_images():
 def test_textures_are_averaged_over_the_pixel_of_a_point(close):
     """Four texels read the level of half that size, all texels their mean, and a thin pixel four probes.
 
-    A pixel counts as smaller than it is, because levels are blurred themselves.
+    A pixel counts as smaller than it is when a level is chosen, because levels are blurred themselves.
     """
     texels = image(16, 16, 3, seed=4)
     corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]])
@@ -89,7 +89,8 @@ def test_textures_are_averaged_over_the_pixel_of_a_point(close):
     close(read([0, 0], [0, 0]), texture.lookup(texels, place), tolerance=1e-5)
     close(read([2 / 16, 0], [0, 2 / 16]), texture.lookup(jnp.asarray(half), place), tolerance=1e-5)
     close(read([1, 0], [0, 1]), np.broadcast_to(np.mean(texels, (0, 1)), (3, 3)), tolerance=1e-5)
-    probes = [texture.lookup(texels, place + np.float32([(n - 1.5) / 4 * 4 / 16, 0])) for n in range(4)]
+    apart = np.float32([1 / 16 / material_table.SHARPER, 0])
+    probes = [texture.lookup(texels, place + (n - 1.5) * apart) for n in range(4)]
     close(read([4 / 16, 0], [0, 0]), np.mean(probes, 0), tolerance=1e-5)
 
 
