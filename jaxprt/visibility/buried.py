@@ -1,4 +1,4 @@
-"""Rays of vertices inside of other solids start where their triangles come out.
+"""Rays of vertices inside of other solids, or just below another sheet, start where their triangles come out.
 
 Such a vertex sees nothing, and no picture shows it. But visibility is interpolated over its triangles, so the part of
 them outside of the solid would turn black towards it. It gets the visibility of the nearest place outside instead.
@@ -12,6 +12,8 @@ from jaxprt.visibility.occluder import Occluder
 
 _RAYS = 48  # rays over the hemisphere of a vertex, none of which leaves a solid
 _INSIDE = 0.25  # share of these that hit a surface from behind; half of them do beside a second solid
+_STEEP = 0.5  # cosine between the normal and rays that count as steep
+_CLOSE = 1e-3  # distance of a sheet that covers a vertex, relative to the scene's diagonal
 _CROSSINGS = 4  # surfaces that are passed on the way out
 
 
@@ -24,7 +26,8 @@ def out_of_solids(
 ) -> tuple[Float32[np.ndarray, "v 3"], Bool[np.ndarray, " v"]]:
     """Moves ray origins of vertices inside of solids to where their triangles come out of these.
 
-    A vertex counts as inside if no ray of its hemisphere escapes and many hit surfaces from behind. Its origin moves
+    A vertex counts as inside if no ray of its hemisphere escapes, and many hit surfaces from behind, or all steep ones
+    a surface so close that no light comes in between, such as the second side of a sheet. Its origin moves
     towards the other corners of its triangles, and the middles of the opposite edges, past the surfaces on the way, to
     the nearest place that is not inside. Vertices whose triangles stay inside keep their origin.
 
@@ -38,13 +41,11 @@ def out_of_solids(
     Returns:
         The ray origins, and whether each vertex is inside.
     """
-    facing = _normals(occluder)
-    buried = _inside(occluder, facing, start, out)
-    inside = np.flatnonzero(buried)
-    if not inside.size:
+    buried = inside(occluder, start, out)
+    if not buried.any():
         return start, buried
-    vertex, goal = _ways(mesh, start, inside)
-    place, length = _outside(occluder, facing, start[vertex], goal, out[vertex], offset[vertex, 0])
+    vertex, goal = _ways(mesh, start, buried)
+    place, length = _outside(occluder, start[vertex], goal, out[vertex], offset[vertex, 0])
     found = np.flatnonzero(np.isfinite(length))
     found = found[np.lexsort((length[found], vertex[found]))]
     found = found[np.unique(vertex[found], return_index=True)[1]]  # the nearest place of each vertex
@@ -67,35 +68,44 @@ def _hit(occluder: Occluder, start: np.ndarray, way: np.ndarray) -> tuple[np.nda
     return triangle, distance
 
 
-def _inside(occluder: Occluder, facing: np.ndarray, start: np.ndarray, out: np.ndarray) -> Bool[np.ndarray, " n"]:
-    """Whether points are inside of solids. Most points are told by the first ray."""
+def inside(
+    occluder: Occluder, start: Float32[np.ndarray, "n 3"], out: Float32[np.ndarray, "n 3"]
+) -> Bool[np.ndarray, " n"]:
+    """Whether ray origins are inside of solids, or just below another sheet: see `out_of_solids`.
+
+    Args:
+        occluder: Geometry that casts shadows.
+        start: Ray origins.
+        out: Unit vectors off the surface. Most points are told by the first ray, which is near this vector.
+    """
+    facing = _normals(occluder)
     number = np.arange(_RAYS) + 0.5
     height = 1 - number / _RAYS
     angle = np.pi * (3 - np.sqrt(5)) * number
     ring = np.sqrt(1 - height**2)
     local = np.stack([ring * np.cos(angle), ring * np.sin(angle), height], -1).astype(np.float32)
-    hidden, behind = np.arange(len(start)), np.zeros(len(start))
+    hidden, behind, covered = np.arange(len(start)), np.zeros(len(start)), np.ones(len(start), bool)
     side = np.cross(out, np.eye(3, dtype=np.float32)[np.argmin(np.abs(out), 1)])
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     other = np.cross(out, side)
     for x, y, z in local:
         way = x * side[hidden] + y * other[hidden] + z * out[hidden]
-        triangle = _hit(occluder, start[hidden], way)[0]
+        triangle, distance = _hit(occluder, start[hidden], way)
         back = np.sum(facing[triangle] * way, 1) > 0
         behind[hidden] += back & (triangle >= 0)
+        if z > _STEEP:
+            covered[hidden] &= distance * z < _CLOSE * occluder.diagonal
         hidden = hidden[triangle >= 0]
         if not hidden.size:
             break
     result = np.zeros(len(start), bool)
-    result[hidden] = behind[hidden] >= _INSIDE * _RAYS
+    result[hidden] = covered[hidden] | (behind[hidden] >= _INSIDE * _RAYS)
     return result
 
 
-def _ways(mesh: Mesh, start: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _ways(mesh: Mesh, start: np.ndarray, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """For each corner of a triangle at a vertex inside of a solid: the vertex, and three goals on the triangle."""
     face = np.asarray(mesh.face)
-    chosen = np.zeros(len(start), bool)
-    chosen[inside] = True
     vertices, goals = [], []
     for corner in range(3):
         row = face[chosen[face[:, corner]]]
@@ -107,7 +117,7 @@ def _ways(mesh: Mesh, start: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray
 
 
 def _outside(
-    occluder: Occluder, facing: np.ndarray, origin: np.ndarray, goal: np.ndarray, out: np.ndarray, offset: np.ndarray
+    occluder: Occluder, origin: np.ndarray, goal: np.ndarray, out: np.ndarray, offset: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The first place on each way that is not inside of a solid, and its distance; infinite where there is none."""
     way = goal - origin
@@ -120,13 +130,12 @@ def _outside(
         triangle, distance = _hit(occluder, place[active], way[active])
         step = distance + 2 * offset[active]
         on_way = (triangle >= 0) & (travelled[active] + step < length[active])
-        active, triangle, step = active[on_way], triangle[on_way], step[on_way]
+        active, step = active[on_way], step[on_way]
         if not active.size:
             break
         travelled[active] += step
         place[active] += step[:, None] * way[active]
-        leaves = active[np.sum(facing[triangle] * way[active], 1) > 0]
-        done = leaves[~_inside(occluder, facing, place[leaves], out[leaves])]
+        done = active[~inside(occluder, place[active], out[active])]
         reached[done] = travelled[done]
         active = np.setdiff1d(active, done)
     return place, reached

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from jaxprt.scene import subdivision
 from jaxprt.scene.light_samples import LightSamples
 from jaxprt.scene.mesh import Mesh
+from jaxprt.visibility.buried import inside
 from jaxprt.visibility.occluder import Occluder, offsets
 from jaxprt.visibility.starts import start_points, starts_and_buried
 
@@ -90,6 +91,19 @@ class DiffuseTracer:
         start, buried = starts_and_buried(mesh, Occluder(_mesh(place, face)), offset=offset)
         own = index[around.size :]
         return self._light(start[own], normal[vertex]), buried[own]
+
+    def at_points(
+        self, start: Float[np.ndarray, "p 3"], normal: Float[np.ndarray, "p 3"], out: Float[np.ndarray, "p 3"]
+    ) -> tuple[Float32[np.ndarray, "p l c"], Bool[np.ndarray, " p"]]:
+        """Reflected radiance at given ray origins, and whether they are inside of solids.
+
+        Args:
+            start: Ray origins, off the surface.
+            normal: Normals of the surface, of any length.
+            out: Unit vectors off the surface.
+        """
+        start = start.astype(np.float32)
+        return self._light(start, normal), inside(self._rays, start, out.astype(np.float32))
 
     def _light(self, start: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Radiance that surfaces with the given normals reflect at the given ray origins."""

@@ -195,9 +195,8 @@ class _Surface:
         self._middle, self._buried = self.light[:0], np.zeros(0, bool)
         area = self._area()
         area = area / max(area.sum(), np.finfo(np.float64).tiny)
-        # No points on sheets: there only shared vertices tell the two sides apart.
-        even = subdivision.scatter(np.where(tracer.double | ~self._coarse, 0, points * area).astype(np.int64))
-        own = (self._coarse & ~tracer.double)[seen[0].triangle]
+        even = subdivision.scatter(np.where(self._coarse, points * area, 0).astype(np.int64))
+        own = self._coarse[seen[0].triangle]
         of_pictures = np.bincount(seen[0].triangle, seen[1], len(area))
         self._shown = seen[1][own].sum() > 0
         self.share = _UNSEEN * area + (1 - _UNSEEN) * of_pictures if self._shown else area
@@ -309,14 +308,28 @@ class _Surface:
     def _traced_points(self) -> tuple[Float32[np.ndarray, "p l c"], Bool[np.ndarray, " p"]]:
         """Radiance at the points inside of triangles, and whether they are inside of solids."""
         triangle, weight = self._points
-        count, corner = len(self.position), self.face[triangle]
+        corner = self.face[triangle]
         place, normal = (
             np.einsum("pk,pkc->pc", weight, np.asarray(each, np.float64)[corner])
             for each in (self.position, self.normal)
         )
-        # Each point becomes a vertex of a small triangle, so that its ray origin is found like that of a vertex.
+        light = np.zeros((len(triangle), *self.light.shape[1:]), self.light.dtype)
+        inside = np.zeros(len(triangle), bool)
+        sheet = self._tracer.double[triangle]
+        for own, traced in ((np.flatnonzero(~sheet), self._beside), (np.flatnonzero(sheet), self._on_sheets)):
+            light[own], inside[own] = traced(triangle[own], place[own], normal[own])
+        return light, inside
+
+    def _beside(
+        self, triangle: Int[np.ndarray, " p"], place: Float[np.ndarray, "p 3"], normal: Float[np.ndarray, "p 3"]
+    ) -> tuple[Float32[np.ndarray, "p l c"], Bool[np.ndarray, " p"]]:
+        """The result of `_traced_points`, for points of triangles without a second side.
+
+        Each point becomes a vertex of a small triangle, so that its ray origin is found like that of a vertex.
+        """
+        count = len(self.position)
         small = (0.5 / np.sqrt(1 + np.bincount(triangle, minlength=1)))[triangle, None, None]
-        beside = place[:, None] + small * (self.position[corner][:, :2] - place[:, None])
+        beside = place[:, None] + small * (self.position[self.face[triangle]][:, :2] - place[:, None])
         position = np.concatenate([place, beside.reshape(-1, 3)]).astype(self.position.dtype)
         around = np.arange(len(place))
         around = np.stack([around, len(place) + 2 * around, len(place) + 2 * around + 1], -1)
@@ -325,6 +338,18 @@ class _Surface:
         normal = np.concatenate([self.normal, normal, np.repeat(normal, 2, 0)])
         offset = self.offset[triangle]
         return self._tracer.at(position, normal, around + count, offset, casting, count + np.arange(len(place)))
+
+    def _on_sheets(
+        self, triangle: Int[np.ndarray, " p"], place: Float[np.ndarray, "p 3"], normal: Float[np.ndarray, "p 3"]
+    ) -> tuple[Float32[np.ndarray, "p l c"], Bool[np.ndarray, " p"]]:
+        """The result of `_traced_points`, for points of triangles with two sides.
+
+        Only shared vertices tell the sides apart. Rays start on that of the normal, whatever touches the sheet there.
+        """
+        out = np.cross(*(self.position[self.face[triangle, k]].astype(np.float64) - place for k in (0, 1)))
+        out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        out *= np.where(np.sum(out * normal, 1, keepdims=True) < 0, -1, 1)
+        return self._tracer.at_points(place + self.offset[triangle, None] * out, normal, out)
 
 
 def _marked(surface: _Surface, edges: Edges, squares: np.ndarray, error: float, room: int) -> Bool[np.ndarray, " e"]:

@@ -63,6 +63,23 @@ def test_the_visibility_of_a_buried_root_is_that_beside_the_wall():
             np.testing.assert_array_equal(triangle < 0, seen)
 
 
+def sheet(size, slope):
+    """Both sides of a square that is tilted about the z axis."""
+    corner = size * np.array([[-1, -slope, -1], [-1, -slope, 1], [1, slope, 1], [1, slope, -1]])
+    return make_mesh(np.concatenate([corner, corner]), np.concatenate([FACES, FACES[:, ::-1] + 4]))
+
+
+def test_rays_below_a_close_sheet_start_where_their_triangles_come_out(monkeypatch):
+    """A wider sheet crosses, at a distance of less than a thousandth of the scene."""
+    one, other = sheet(1, 0.0), sheet(3, 1e-3)
+    start, elsewhere = moved(one, join([one, other]), monkeypatch)
+    position, up = np.asarray(one.position), np.asarray(one.normal)[:, 1] > 0
+    np.testing.assert_array_equal(elsewhere, (position[:, 0] > 0) == up)
+    np.testing.assert_allclose(start[elsewhere][:, 0], 0, atol=0.02)
+    # Sheets that are farther apart leave room for light.
+    assert not moved(one, join([one, sheet(3, 0.1)]), monkeypatch)[1].any()
+
+
 @pytest.mark.parametrize(
     ("mesh", "others"),
     [
