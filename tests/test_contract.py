@@ -775,6 +775,7 @@ EXAMPLES = {
         lambda draw: call(draw.fragments(), draw.mesh().face, draw.normal(6, 2)),
         gradient=("attribute",),
     ),
+    "image.pixels.by_color": example(lambda draw: call(draw.normal(7, 3)), colors=1),
     "image.pixels.resolve": example(
         lambda draw: call(draw.pixels(), draw.normal(60, 3), background=draw.uniform(5, 6, 3)),
         gradient=("color", "background"),

@@ -1,7 +1,8 @@
 """What samples see of scenes with backs that are hidden, holes, and translucent surfaces.
 
 Opaque surfaces are rasterized. Rays through the samples collect the surfaces with an opacity in front of them. Each
-sample then sees a list of surfaces, from front to back, of which each hides the share `opacity` of the next ones.
+sample then sees a list of surfaces, from front to back, of which each hides the share `opacity` of the next ones. Glass
+colors what it lets through, and is itself seen whole.
 """
 
 import dataclasses
@@ -72,7 +73,7 @@ def coverage(
         seen = jnp.asarray(fragments.triangle >= 0, jnp.result_type(float))
         return seen if seen.ndim == 2 else jnp.mean(seen, -1)
     slots = _slots(mesh, camera, samples, hidden, occluder)
-    empty = sum(np.mean(np.where(triangle < 0, share, 0), -1) for triangle, _, share in slots)
+    empty = sum(np.mean(np.where(triangle < 0, _gray(share), 0), -1) for triangle, _, share in slots)
     return jnp.asarray(1 - empty, jnp.result_type(float))
 
 
@@ -94,6 +95,7 @@ def nearest_fragments(
     random = np.random.default_rng(0).random(slots[0][0].shape)
     triangle, depth, total = np.full(random.shape, -1, np.int32), np.full(random.shape, np.inf, np.float32), 0.0
     for one, where, share in slots:
+        share = _gray(share)
         chosen = (random >= total) & (random < total + share)
         triangle, depth, total = np.where(chosen, one, triangle), np.where(chosen, where, depth), total + share
     triangle, depth = jnp.asarray(triangle[..., 0]), jnp.asarray(depth[..., 0])
@@ -118,10 +120,11 @@ def _hidden_now(mesh: Mesh, camera: Camera, hidden: Any) -> Any:
 
 def _slots(
     mesh: Mesh, camera: Camera, samples: int, hidden: Any, occluder: Occluder
-) -> list[tuple[Int[np.ndarray, "h w s"], Float[np.ndarray, "h w s"], Float[np.ndarray, "h w s"]]]:
+) -> list[tuple[Int[np.ndarray, "h w s"], Float[np.ndarray, "h w s"], Float[np.ndarray, "h w s *c"]]]:
     """The surfaces that samples see, from front to back: triangles, depths, and the share that each sample sees.
 
-    Where a sample has no more surfaces, the triangle is -1 and the share that of the background.
+    Shares are those of each color if there is colored glass. Where a sample has no more surfaces, the triangle is -1
+    and the share that of the background.
     """
     if not known(camera, mesh):
         raise ValueError(
@@ -131,7 +134,10 @@ def _slots(
     assert occluder.opacity is not None
     count = len(occluder.face)
     clear = np.zeros(len(mesh.face), bool)
-    clear[:count] = np.asarray(occluder.opacity.layer)[occluder.face[:, 0]] > 0
+    layer = np.asarray(occluder.opacity.layer)[occluder.face[:, 0]]
+    clear[:count] = layer > 0
+    passing, glass = np.asarray(occluder.opacity.passing), np.asarray(occluder.opacity.glass)
+    passing = passing[layer, : 1 if np.all(passing == 1) else 3]
     away = np.zeros(len(mesh.face), bool) if hidden is None else _hidden_now(mesh, camera, hidden)
     opaque = dataclasses.replace(mesh, face=np.where((clear | away)[:, None], 0, np.asarray(mesh.face)))
     base = raster.rasterize(opaque, camera, samples=samples)
@@ -143,34 +149,53 @@ def _slots(
         direction = _directions(camera, samples, np.arange(len(behind[0]))[own])
         far = np.minimum(behind[1][own], 1e30).astype(np.float32)
         eye = np.asarray(camera.eye, np.float32)
-        met = occluder.translucent.layers(eye, direction, far, away[:count])
-        chunks.append(_chunk(*met, behind[0][own], behind[1][own]))
+        number, face, place, alpha = occluder.translucent.layers(eye, direction, far, away[:count])
+        pair = np.where(glass[layer[face]], 1, alpha), (1 - alpha)[..., None] * passing[face]
+        chunks.append(_chunk(number, face, place, *pair, behind[0][own], behind[1][own]))
     most = max(len(chunk[0]) for chunk in chunks)
     nothing = -1, np.inf, 0
     columns = []
     for value, rows in zip(nothing, zip(*chunks, strict=True), strict=True):
-        filled = [np.pad(row, ((0, most - len(row)), (0, 0)), constant_values=value) for row in rows]
-        columns.append(np.concatenate(filled, 1).reshape(most, *shape))
+        wide = [((0, most - len(row)), *((0, 0),) * (row.ndim - 1)) for row in rows]
+        filled = [np.pad(row, width, constant_values=value) for row, width in zip(rows, wide, strict=True)]
+        columns.append(np.concatenate(filled, 1).reshape(most, *shape, *filled[0].shape[2:]))
     return list(zip(*columns, strict=True))
 
 
-def _chunk(count, face, place, alpha, triangle, depth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles, depths and shares of the surfaces on some rays, [k, n], with those behind all layers."""
+def _gray(share: Float[np.ndarray, "h w s *c"]) -> Float[np.ndarray, "h w s"]:
+    """Shares without their colors."""
+    return share if share.ndim == 3 else share.mean(-1)
+
+
+def _chunk(count, face, place, own, through, triangle, depth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Triangles, depths and shares [k, n, c] of the surfaces on some rays, with those behind all layers.
+
+    Args:
+        count: Number of layers on each ray.
+        face: Their triangles.
+        place: Their depths.
+        own: Share of a view of each layer that shows the layer itself.
+        through: Share that shows what is behind it, for each color.
+        triangle: What is behind all layers of each ray.
+        depth: Its depth.
+    """
     listed = np.arange(face.shape[1]) < count[:, None]
-    left = np.cumprod(np.where(listed, 1 - alpha, 1), 1)
-    before = np.concatenate([np.ones((len(left), 1), left.dtype), left[:, :-1]], 1)
+    left = np.cumprod(np.where(listed[..., None], through, 1), 1)
+    before = np.concatenate([np.ones_like(left[:, :1]), left[:, :-1]], 1)
     rows, ends = np.arange(len(count)), count.copy()
     width = face.shape[1] + 1
     triangles, depths = np.full((len(count), width), -1, np.int32), np.full((len(count), width), np.inf, np.float32)
-    shares = np.zeros((len(count), width), np.float32)
+    shares = np.zeros((len(count), width, left.shape[2]), np.float32)
     triangles[:, :-1], depths[:, :-1] = np.where(listed, face, -1), np.where(listed, place, np.inf)
-    shares[:, :-1] = np.where(listed, before * alpha, 0)
+    shares[:, :-1] = np.where(listed[..., None], before * own[..., None], 0)
     triangles[rows, ends], depths[rows, ends] = triangle, depth
-    shares[rows, ends] = np.where(count > 0, left[rows, np.maximum(count - 1, 0)], 1)
+    shares[rows, ends] = np.where(count[:, None] > 0, left[rows, np.maximum(count - 1, 0)], 1)
     # Nothing is seen behind what hides everything.
-    triangles = np.where(shares > 0, triangles, -1)
-    used = max(1, int(np.max(np.where(np.any(shares > 0, 0), np.arange(1, width + 1), 0))))
-    return triangles.T[:used], depths.T[:used], shares.T[:used]
+    some = np.any(shares > 0, 2)
+    triangles = np.where(some, triangles, -1)
+    used = max(1, int(np.max(np.where(np.any(some, 0), np.arange(1, width + 1), 0))))
+    shares = shares[..., 0] if left.shape[2] == 1 else shares
+    return triangles.T[:used], depths.T[:used], np.swapaxes(shares, 0, 1)[:used]
 
 
 def _directions(camera: Camera, samples: int, number: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
@@ -194,7 +219,7 @@ def _joined(layers: list[Pixels]) -> Pixels:
     count = len(order)
     unit = 1 << max(count.bit_length() - 4, 0)
     room = max(-(-count // unit) * unit, 1) - count
-    height, width = layers[0].background.shape
+    height, width = layers[0].background.shape[:2]
     value = {"triangle": -1, "pixel": height * width - 1}
     rows = {
         name: np.concatenate([field[order], np.full((room, *field.shape[1:]), value.get(name, 0), field.dtype)])

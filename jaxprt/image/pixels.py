@@ -38,17 +38,18 @@ class Pixels(eqx.Module):
         barycentric: Perspective-correct barycentric coordinates, not negative. They sum to 1, or to 0 in padding.
         slope: Change of the barycentric coordinates per pixel to the right, and per pixel down.
         pixel: Index of each point's pixel, row * width + column.
-        coverage: Fraction of the pixel's samples that see the surface of the point; 0 in padding.
-        background: Fraction of each pixel's samples that see no triangle. The remaining samples see backs of surfaces,
-            which are black.
+        coverage: Fraction of the pixel's samples that see the surface of the point, for each color if they see it
+            through glass; 0 in padding.
+        background: Fraction of each pixel's samples that see no triangle, for each color if they look through glass.
+            The remaining samples see backs of surfaces, which are black.
     """
 
     triangle: Int[Array | np.ndarray, " p"]
     barycentric: Float[Array | np.ndarray, "p 3"]
     slope: Float[Array | np.ndarray, "p 2 3"]
     pixel: Int[Array | np.ndarray, " p"]
-    coverage: Float[Array | np.ndarray, " p"]
-    background: Float[Array, "h w"]
+    coverage: Float[Array | np.ndarray, "p *c"]
+    background: Float[Array, "h w *c"]
 
 
 @in_common_coordinates
@@ -58,7 +59,7 @@ def shading_points(
     camera: Camera,
     *,
     uneven: Bool[Array, " f"] | None = None,
-    share: Float[Array, "h w s"] | None = None,
+    share: Float[Array, "h w s *c"] | None = None,
 ) -> Pixels:
     """Finds one shading point for each pixel and each surface that the pixel shows.
 
@@ -158,10 +159,10 @@ def resolve(
     """
     if color.shape[:1] != pixels.triangle.shape or color.ndim != 2:
         raise ValueError(f"color must be [{len(pixels.triangle)}, c], one per point, got {list(color.shape)}")
-    height, width = pixels.background.shape
+    height, width = pixels.background.shape[:2]
     if not jnp.issubdtype(color.dtype, jnp.inexact):
         color = color.astype(pixels.coverage.dtype)
-    coverage = pixels.coverage.astype(color.dtype)[:, None]
+    coverage = by_color(pixels.coverage, color.shape[1]).astype(color.dtype)
     image = jnp.zeros((height * width, color.shape[1]), color.dtype)
     image = image.at[pixels.pixel].add(
         jnp.where(coverage > 0, coverage * color, 0), indices_are_sorted=True, mode="promise_in_bounds"
@@ -169,8 +170,21 @@ def resolve(
     image = image.reshape(height, width, -1)
     if background is None:
         return image
-    share = pixels.background.astype(color.dtype)[..., None]
+    share = by_color(pixels.background, color.shape[1], axes=2).astype(color.dtype)
     return image + jnp.where(share > 0, share * background, 0)
+
+
+def by_color(share: Any, colors: int, *, axes: int = 1) -> Any:
+    """Shares of points or pixels with an axis of colors: their own, or one for all; the mean for other numbers of them.
+
+    Args:
+        share: Shares, with an axis of colors or without.
+        colors: Number of colors of the picture.
+        axes: Number of axes without that of colors.
+    """
+    if share.ndim == axes:
+        return share[..., None]
+    return share if share.shape[-1] == colors else share.mean(-1, keepdims=True)
 
 
 @require.arguments(
@@ -355,20 +369,22 @@ def _points(
 
 
 @jit
-def _shared(sample: Int[Array, " p"], members: UInt8[Array, "n s"], share: Float[Array, "h w s"]) -> Float[Array, " p"]:
+def _shared(sample: Int[Array, " p"], members: UInt8[Array, "n s"], share: Float[Array, "h w s *c"]) -> Array:
     """Coverage of the surfaces that some samples represent, by the shares of their samples."""
     samples = members.shape[1]
     used, sample = sample >= 0, jnp.maximum(sample, 0)
     member = jnp.where(used, members.ravel()[sample], 0)
-    own = share.reshape(-1, samples)[sample // samples]
+    own = share.reshape(-1, samples, *share.shape[3:])[sample // samples]
+    member = member.reshape(-1, *(1,) * (share.ndim - 3))
     bits = [jnp.where((member >> number) & 1, own[:, number], 0) for number in range(samples)]
     return functools.reduce(jnp.add, bits) / samples
 
 
 @jit
-def _empty_share(fragments: Fragments, share: Float[Array, "h w s"]) -> Float[Array, "h w"]:
+def _empty_share(fragments: Fragments, share: Float[Array, "h w s *c"]) -> Float[Array, "h w *c"]:
     """Share of each pixel that sees no triangle."""
-    return jnp.mean(jnp.where(fragments.triangle.reshape(share.shape) < 0, share, 0), -1)
+    empty = fragments.triangle.reshape(*share.shape[:3], *(1,) * (share.ndim - 3)) < 0
+    return jnp.mean(jnp.where(empty, share, 0), 2)
 
 
 def _affine(x, y, q):

@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxprt.compile import jit, known, put
-from jaxprt.image.pixels import Pixels
+from jaxprt.image.pixels import Pixels, by_color
 from jaxprt.image.skies import pixel_angle
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.environment import background
@@ -67,7 +67,7 @@ def points_of(
 
 
 def sky(
-    environment: Environment, camera: Camera, ray: Float[Array, "h w 3"], share: Float[Array, "h w"], *, colors: int
+    environment: Environment, camera: Camera, ray: Float[Array, "h w 3"], share: Float[Array, "h w *c"], *, colors: int
 ) -> Float[Array, "h w _"]:
     """The environment where nothing hides it, in a number of colors.
 
@@ -75,25 +75,25 @@ def sky(
         environment: The light.
         camera: The camera of the pixels.
         ray: Unit direction in world space from the eye through the center of each pixel.
-        share: Fraction of each pixel that sees nothing else.
+        share: Fraction of each pixel that sees nothing else, for each color if it looks through glass.
         colors: Number of colors of the picture.
     """
     if environment.panorama is None or not known(environment, camera, ray, share):
         return _texels_behind(environment, ray, share, colors=colors)
-    cover = np.asarray(share).reshape(-1)
-    seen = np.flatnonzero(cover > 0)
+    cover = by_color(np.asarray(share), colors, axes=2).reshape(share.shape[0] * share.shape[1], -1)
+    seen = np.flatnonzero(cover.max(1) > 0)
     color = environment.panorama.sampled(np.asarray(ray).reshape(-1, 3)[seen], pixel_angle(camera).reshape(-1)[seen])
     picture = np.zeros((len(cover), colors), environment.radiance.dtype)
-    picture[seen] = cover[seen, None] * color
-    return put(picture.reshape(*share.shape, colors))
+    picture[seen] = cover[seen] * color
+    return put(picture.reshape(*share.shape[:2], colors))
 
 
 @partial(jit, static_argnames="colors")
 def _texels_behind(
-    environment: Environment, ray: Float[Array, "h w 3"], share: Float[Array, "h w"], *, colors: int
+    environment: Environment, ray: Float[Array, "h w 3"], share: Float[Array, "h w *c"], *, colors: int
 ) -> Float[Array, "h w _"]:
     behind = background(environment, ray)
-    share = share.astype(behind.dtype)[..., None]
+    share = by_color(share, colors, axes=2).astype(behind.dtype)
     picture = jnp.where(share > 0, share * behind, 0)
     return jnp.broadcast_to(picture, (*picture.shape[:2], colors))
 
@@ -113,16 +113,17 @@ def drawn(
     index = index.reshape(-1)
     own = xp.maximum(index, 0)
     pixel, coverage = (xp.asarray(each)[own] for each in (pixels.pixel, pixels.coverage))
-    coverage = xp.where(index < 0, xp.zeros((), coverage.dtype), coverage)
+    coverage = by_color(coverage, picture.shape[2])
+    coverage = xp.where((index < 0)[:, None], xp.zeros((), coverage.dtype), coverage)
     return _added(picture, pixel, coverage, color.reshape(-1, color.shape[-1]))
 
 
 @partial(jit, donate_argnames="picture")
 def _added(
-    picture: Float[Array, "h w c"], pixel: Int[Array, " p"], coverage: Float[Array, " p"], color: Float[Array, "p d"]
+    picture: Float[Array, "h w c"], pixel: Int[Array, " p"], coverage: Float[Array, "p _"], color: Float[Array, "p d"]
 ) -> Float[Array, "h w c"]:
     height, width, colors = picture.shape
-    share = coverage.astype(picture.dtype)[:, None]
+    share = coverage.astype(picture.dtype)
     part = jnp.where(share > 0, share * jnp.broadcast_to(color, (len(color), colors)), 0)
     flat = picture.reshape(-1, colors)
     return flat.at[pixel].add(part, mode="promise_in_bounds").reshape(height, width, colors)

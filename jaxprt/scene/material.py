@@ -127,8 +127,9 @@ class TexturedMaterial(eqx.Module):
         clearcoat: Weight of a clear coat, from 0 to 1; see KHR_materials_clearcoat and `jaxprt.brdf.ClearCoat`.
         clearcoat_roughness: Perceptual roughness of the coat, from 0 to 1.
         transmission: Fraction of the light under the surface that passes through in place of being reflected
-            diffusely, from 0 to 1; see KHR_materials_transmission. Surfaces reflect less by it. Nothing is seen through
-            them, and no light passes through them.
+            diffusely, from 0 to 1; see KHR_materials_transmission. Surfaces are thin: light and views pass straight
+            through, less what is reflected at normal incidence. Views are tinted by the mean base color, light is
+            dimmed by its luminance. It is part of the shape of a scene: see `alpha_mode`.
         clearcoat_texture: Texture [h w 1] that multiplies `clearcoat`.
         clearcoat_roughness_texture: Texture [h w 1] that multiplies `clearcoat_roughness`.
         transmission_texture: Texture [h w 1] that multiplies `transmission`.

@@ -5,7 +5,7 @@ It belongs to the shape of a scene: it is read when a scene is precomputed, and 
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 BLEND = -1.0  # in place of a cutoff, for surfaces that stop the share alpha
 CLEAR = 1 / 512  # share of light that no 8-bit image resolves: less is nothing, and all but this is everything
@@ -25,6 +25,8 @@ class Opacity(eqx.Module):
         start: Index of the image's first texel; -1 without an image.
         shape: Height and width of the image.
         texel: The texels of all images, row by row, first row on top.
+        passing: Color of the light that passes each layer, relative to its mean: 1 for alpha, a tint for glass.
+        glass: Whether a layer lets light through without being reflected less, as glass does and holes do not.
     """
 
     coordinate: Float[Array | np.ndarray, "v 2"]
@@ -35,6 +37,8 @@ class Opacity(eqx.Module):
     start: Int[Array | np.ndarray, " m"]
     shape: Int[Array | np.ndarray, "m 2"]
     texel: Float[Array | np.ndarray, " t"]
+    passing: Float[Array | np.ndarray, "m 3"]
+    glass: Bool[Array | np.ndarray, " m"]
 
     @property
     def blends(self) -> bool:

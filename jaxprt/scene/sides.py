@@ -25,7 +25,7 @@ def two_sided(scene: Scene) -> Scene:
     """The scene with a reversed copy of each face whose back is lit and can be seen.
 
     Faces are copied if their material has `back="lit"`, unless nothing sees their back: they belong to a closed surface
-    with outward faces, without holes by alpha, that contains no camera of the scene; or the mesh has a reversed copy of
+    with outward faces, without holes, that contains no camera of the scene; or the mesh has a reversed copy of
     them already. The copies, with their vertices, follow those of their part. Materials then have `back="hidden"`, so
     that a scene without lit backs, or one that this function has made, is returned unchanged.
 
@@ -63,10 +63,8 @@ def _seen_backs(scene: Scene) -> list[Bool[np.ndarray, " f"]]:
     face, position = np.asarray(mesh.face), np.asarray(mesh.position, np.float64)
     corner = places(position)[face]
     piece = _pieces(corner)
-    clear = np.array(
-        [isinstance(p.material, TexturedMaterial) and p.material.alpha_mode != "opaque" for p in scene.parts]
-    )
-    pierced = np.bincount(piece, clear[np.asarray(mesh.region)[face[:, 0]]]) > 0
+    clear = np.zeros(len(position)) if mesh.opacity is None else np.asarray(mesh.opacity.layer) > 0
+    pierced = np.bincount(piece, clear[face[:, 0]]) > 0
     closed = _closed(corner, piece) & ~pierced & (_volumes(position[face], piece) > 0)
     for camera in scene.cameras:
         closed &= _windings(position[face], piece, np.asarray(camera.eye, np.float64)) < _INSIDE

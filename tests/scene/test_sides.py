@@ -60,8 +60,10 @@ def test_the_inside_of_a_room_is_seen_by_cameras_and_through_holes():
     inside, outside = (Camera(eye, (0.0, 0, 0.1), (0.0, 1, 0), 1.0, 8, 8) for eye in ((0.0, 0, 0), (0.0, 0, 2)))
     assert counts(two_sided(Scene([room], [outside]))) == [(8, 12)]
     assert counts(two_sided(Scene([room], [outside, inside]))) == [(16, 24)]
-    pierced = dataclasses.replace(room, material=TexturedMaterial(back="lit", alpha_mode="mask"))
-    assert counts(two_sided(Scene([pierced]))) == [(16, 24)]
+    pierced = dataclasses.replace(room, material=TexturedMaterial(back="lit", alpha_mode="mask", alpha=0.4))
+    glass = dataclasses.replace(room, material=TexturedMaterial(1.0, 0.0, back="lit", transmission=0.5))
+    for open_room in (pierced, glass):
+        assert counts(two_sided(Scene([open_room]))) == [(16, 24)]
 
 
 def test_files_that_hold_both_sides_get_no_third():

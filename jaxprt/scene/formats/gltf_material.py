@@ -60,7 +60,9 @@ class MaterialReader:
         if "clearcoatNormalTexture" in coat:
             self.ignored.add("normal maps of clearcoats (a coat has the normals of its base)")
         if passing.get("transmissionFactor", 0) != 0:
-            self.ignored.add("what is seen through transmitting surfaces (their reflection is read)")
+            self.ignored.add(
+                "refraction and blur of what is seen through transmitting surfaces (they are thin and clear)"
+            )
         field: dict[str, Any] = {
             "base_color": self._number(pbr, "baseColorFactor", (1.0, 1.0, 1.0, 1.0), owner)[:3],
             "metallic": self._number(pbr, "metallicFactor", 1.0, owner),

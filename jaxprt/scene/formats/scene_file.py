@@ -50,7 +50,7 @@ def load_scene(
     Of a glTF file, this reads metallic-roughness materials with textures, normal maps, vertex colors, two sets of
     texture coordinates, alpha, double-sided materials, skins, morph targets, and perspective cameras, whose pictures
     are 512 pixels high. It supports the extensions KHR_materials_ior, _specular, _anisotropy, _emissive_strength,
-    _clearcoat and _transmission (its reflection only), KHR_texture_transform, KHR_mesh_quantization and
+    _clearcoat and _transmission (thin glass), KHR_texture_transform, KHR_mesh_quantization and
     EXT_mesh_gpu_instancing. Point lights and spots of KHR_lights_punctual become point lights of the scene. Its
     directional lights become suns, which `jaxprt.scene.with_suns` adds to an environment. Triangles without normals are
     flat. Compressed geometry and textures (Draco, meshoptimizer, KTX 2) are decoded by the packages of `jaxprt[web]`

@@ -603,7 +603,7 @@ def test_all_textures_are_transformed_and_coats_and_transmission_are_read(tmp_pa
     item = {"pbrMetallicRoughness": pbr, "normalTexture": texture, "emissiveTexture": texture, "extensions": extension}
     writer.header["materials"] = [item]
     one(writer.square(material=0, TEXCOORD_0=PLACE, TEXCOORD_1=PLACE), writer=writer)
-    with pytest.warns(UserWarning, match="ignored are normal maps of clearcoats .*, what is seen through transmitting"):
+    with pytest.warns(UserWarning, match="ignored are normal maps of clearcoats .*, refraction and blur"):
         material = load_scene(writer.write(tmp_path / "a.glb")).parts[0].material
     assert len(material.textures) == 11
     for each in material.textures:
