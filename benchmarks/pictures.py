@@ -3,11 +3,11 @@
     python -m benchmarks.pictures [--quick] [--only TEXT] [--system NAME] [--edge N] [--store FOLDER] [--plot FILE]
         [--pictures FOLDER]
 
-Objects stand on a matte ground, in direct light. Judge is Mitsuba's converged picture of the same triangles, normals,
-materials and light: see `benchmarks.denoised`. `error` is relative L2 over the pixels that surfaces fill, without the
-background; two pictures of unlike seeds stand for the converged one, so that its noise, `noise`, has no part in it.
-`flip` is FLIP. Pixels are means over their squares on both sides. `seconds` are of the picture that is judged, with a
-new light and a new view.
+Objects stand on a matte ground, in direct light. Judge is Mitsuba's converged picture of the same triangles, normals
+and materials, and of the pixels of the light's file in 6 x 256 x 256 texels: see `benchmarks.denoised`. `error` is
+relative L2 over the pixels that surfaces fill, without the background; two pictures of unlike seeds stand for the
+converged one, so that its noise, `noise`, has no part in it. `flip` is FLIP. Pixels are means over their squares on
+both sides. `seconds` are of the picture that is judged, with a new light and a new view.
 
 Lines of Mitsuba have its picture by `samples` samples per pixel, bare and denoised (also with `clean` albedo and
 normals, a larger network), compiling left out. Lines of ours name it as their peer: `peer_seconds` is the time at which
@@ -33,6 +33,7 @@ from jaxprt.brdf import AshikhminShirley, Lambert, MetallicRoughness
 from jaxprt.relit import Harmonics, Lobes, Terms, refine
 from jaxprt.scene import Camera, Environment, Mesh, Part, Scene, builtin, load_environment, load_mesh
 from jaxprt.scene.camera import orbit
+from jaxprt.scene.environment import finer
 from jaxprt.scene.mesh import ground_plane
 
 EDGE = 512
@@ -157,7 +158,7 @@ def measure(
 ) -> Iterator[dict]:
     """Lines of one case: Mitsuba's, then ours."""
     parts = [(part.mesh, part.material) for part in case.scene.parts]
-    seen = denoised.View(parts, case.light, case.camera)
+    seen = denoised.View(parts, finer(case.light), case.camera)
     path = store and store / f"{file_name(*case.names, str(case.camera.width))}.npz"
     noise = 0.02 if quick else NOISE.get(case.names[1], NOISE_ELSEWHERE)
     most, block = (144, 36) if quick else (MOST, denoised.BLOCK)
