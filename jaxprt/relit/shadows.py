@@ -44,10 +44,12 @@ class TexelShares(eqx.Module):
     Attributes:
         texel: Indices of the texels.
         share: Share of each texel that each point of the picture sees, in 255ths.
+        place: Where in each texel the light of its file comes from; see `light_samples.places_in_texels`.
     """
 
     texel: Int[Array, " t"]
     share: UInt8[Array | np.ndarray, "t p"]
+    place: Float[Array, "t 4"]
 
 
 class TracedLight(eqx.Module):
@@ -63,14 +65,14 @@ class TracedLight(eqx.Module):
     excess: Float[Array, "t c"]
     shares: TexelShares
 
-    def row(self, index: Any) -> tuple[Int[Array, " t"], Float[Array, "t c"], UInt8[Array, "t p"]]:
-        """The texels, what is taken out of them, and their shares at some points; an index of -1 is padding."""
+    def row(self, index: Any) -> tuple[Array, Array, Array, Array]:
+        """The texels, what is taken out of them, their shares at some points, and places; -1 as index is padding."""
         share = self.shares.share
         if known(share, index):  # The number of points depends on the view.
             row = put(np.asarray(share)[:, np.maximum(index, 0)])
         else:
             row = jnp.asarray(share)[:, jnp.maximum(index, 0)]
-        return self.shares.texel, self.excess, row
+        return self.shares.texel, self.excess, row, self.shares.place
 
 
 def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, keep: bool) -> TracedLight | None:
@@ -102,7 +104,8 @@ def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, k
     share = np.zeros((len(number), len(pixels.triangle)), np.uint8)
     rays = texel_rays.TexelRays(direction, count)
     share[bright] = _shares(mesh, pixels, width, number[bright], rays) if keep else _cast(mesh, pixels, width, rays)
-    return TracedLight(rest, excess, TexelShares(texel, share))
+    place = light_samples.places_in_texels(number, fine, size=size)
+    return TracedLight(rest, excess, TexelShares(texel, share, put(place.astype(environment.radiance.dtype))))
 
 
 def untraced(environment: Environment) -> Environment:

@@ -165,6 +165,7 @@ def from_texels(
     texel: Int[Array, " t"],
     excess: Float[Array, "t c"],
     share: UInt8[Array, "t p"],
+    place: Float[Array, "t 4"],
     *,
     size: int,
     samples: int,
@@ -177,11 +178,12 @@ def from_texels(
         texel: Indices of the texels.
         excess: Their radiance.
         share: Share of each texel that each point sees, in 255ths.
+        place: Where in each texel its light comes from.
         size: Edge of the cubemap faces in texels.
         samples: Number of sample points along the edge of each texel.
     """
     light = texel, excess / texel_rays.FULL, share
-    options = {"size": size, "samples": samples}
+    options = {"size": size, "samples": samples, "place": place}
     return bright_texels.sent(
         surface.brdf, sight.frame, sight.wo, light, None, sight.blend, above=sight.above, **options
     )

@@ -126,6 +126,35 @@ def _on_curve(fraction: Float[np.ndarray, " d"]) -> Float[np.ndarray, "2 d"]:
     return place
 
 
+def places_in_texels(
+    texel: Int[np.ndarray, " t"], radiance: Float[np.ndarray, "6 m m c"], *, size: int
+) -> Float[np.ndarray, "t 4"]:
+    """Where in some texels of a light its flux comes from, by the same light at a finer resolution.
+
+    Args:
+        texel: Indices of the texels.
+        radiance: The light at the finer resolution, whose edge is a multiple of `size`.
+        size: Edge of the cubemap faces in texels.
+
+    Returns:
+        For each texel the mean place along rows and down columns, from -1 to 1, and its standard deviation along both,
+        relative to that of even light: 0, 0, 1, 1 for light from everywhere, and for texels without flux.
+    """
+    factor = radiance.shape[1] // size
+    face, row, column = texel // size**2, texel // size % size, texel % size
+    down, across = (factor * each[:, None] + np.arange(factor) for each in (row, column))
+    fine = np.maximum(radiance[face[:, None, None], down[:, :, None], across[:, None]].astype(np.float64).sum(-1), 0)
+    fine = np.where(fine.sum((1, 2), keepdims=True) > 0, fine, 1)
+    share = fine / fine.sum((1, 2), keepdims=True)
+    place = (2 * np.arange(factor) + 1) / factor - 1
+    own = 1 / (3 * factor**2)  # variance of a fine texel
+    mean, spread = [], []
+    for weight in (share.sum(1), share.sum(2)):
+        mean.append(weight @ place)
+        spread.append(np.sqrt(3 * (weight @ place**2 - mean[-1] ** 2 + own)))
+    return np.stack([*mean, *spread], -1)
+
+
 def in_texels(
     texel: Int[np.ndarray, " t"], radiance: Float[np.ndarray, "6 m m c"], *, size: int, count: int
 ) -> Float32[np.ndarray, "t n 3"]:

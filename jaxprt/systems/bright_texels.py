@@ -304,6 +304,7 @@ def sent(
     size: int,
     samples: int,
     above: Float[Array, "p 3"] | None = None,
+    place: Float[Array, "t 4"] | None = None,
 ) -> Float[Array, "p e"]:
     """Radiance that vertices or points send: the sum over texels of light x BRDF x cosine x visibility.
 
@@ -318,6 +319,8 @@ def sent(
         size: Edge of the cubemap faces in texels.
         samples: Number of sample points along the edge of each texel.
         above: Normals below whose horizon no light arrives, in addition to those of the frames; None without.
+        place: Where in each texel its light comes from, from `jaxprt.scene.light_samples.places_in_texels`; None for
+            everywhere.
     """
     texel, excess, visible = light
     protocol.check_colors(excess.shape[1], 1 if blend is None else blend.weight.shape[2])
@@ -347,7 +350,7 @@ def sent(
             cosine = jnp.where(_along(above.T, direction) > 0, cosine, 0)
         return value(wi, wo, *parameter) * cosine
 
-    direction, area = (each.astype(excess.dtype) for each in _points(texel, size, samples))
+    direction, area = (each.astype(excess.dtype) for each in _points(texel, size, samples, place))
     # Texels are processed one by one, so that intermediate arrays stay in the processor's cache.
     return total(lit, (direction, area, excess, visible)).T
 
@@ -419,20 +422,27 @@ def _irradiance(transport: Visibility, texel: Array, excess: Array) -> Array:
     return (excess.T @ flux).T / np.pi
 
 
-def _points(texel: Int[Array, " t"], size: int, samples: int) -> tuple[Array, Array]:
+def _points(texel: Int[Array, " t"], size: int, samples: int, spot: Float[Array, "t 4"] | None) -> tuple[Array, Array]:
     """Directions of the k sample points in texels t, and the integral of direction that each stands for, [t k 3]."""
-    if samples == 1:
+    if samples == 1 and spot is None:
         direction, area = (each(size=size).reshape(-1, 3) for each in (cubemap.direction, cubemap.vector_area))
         return direction[texel, None], area[texel, None]
     place, weight = np.polynomial.legendre.leggauss(samples)
     face, row = jnp.divmod(texel[:, None, None], size**2)
     row, column = jnp.divmod(row, size)
-    s, t = (2 * column + 1 + place) / size - 1, (2 * row + 1 + place[:, None]) / size - 1
     axis = jnp.asarray(cubemap.axes())[face]
-    point = s[..., None] * axis[..., 0, :] + t[..., None] * axis[..., 1, :] + axis[..., 2, :]
-    length = jnp.linalg.norm(point, axis=-1, keepdims=True)
-    area = point / length**4 * (weight * weight[:, None] / size**2)[..., None]
-    return (point / length).reshape(len(texel), -1, 3), area.reshape(len(texel), -1, 3)
+
+    def points(across: Any, down: Any) -> tuple[Array, Array]:
+        s, t = (2 * column + 1 + across) / size - 1, (2 * row + 1 + down) / size - 1
+        point = s[..., None] * axis[..., 0, :] + t[..., None] * axis[..., 1, :] + axis[..., 2, :]
+        length = jnp.linalg.norm(point, axis=-1, keepdims=True)
+        return point / length, (weight * weight[:, None] / size**2)[..., None] / length**3
+
+    direction, area = points(place, place[:, None])
+    if spot is not None:  # Points move to where the light is, with the flux that they stand for.
+        middle, width = jnp.moveaxis(spot.reshape(-1, 2, 2, 1, 1), 0, 2)
+        direction, _ = points(middle[0] + width[0] * place, middle[1] + width[1] * place[:, None])
+    return direction.reshape(len(texel), -1, 3), (area * direction).reshape(len(texel), -1, 3)
 
 
 def _flux(normal: Float[Array, "3 v"], texel: Array, visible: Float[Array, "t v"], *, size: int) -> Array:

@@ -54,6 +54,22 @@ def test_the_shadow_of_a_sun_is_where_it_belongs_on_a_floor_of_four_vertices(rel
     assert np.all(without[dark] > 0.9 * sun)  # Interpolation between the corners knows nothing of the lid.
 
 
+def test_a_low_sun_shines_from_its_place_in_the_file(relit, tmp_path):
+    """It is a tenth of a texel wide, and the middle of its texel is half as high again."""
+    path, height, width = tmp_path / "low.exr", 128, 256
+    image = np.zeros((height, width, 3), np.float32)
+    row, column = height // 2 - 7, 5 * width // 8
+    image[row, column] = 1e4
+    prt.files.write_exr(path, image)
+    edge = np.cos(np.pi * np.array([row, row + 1]) / height)
+    irradiance = 1e4 * (edge[0] - edge[1]) * 2 * np.pi / width * edge.mean()
+    light = prt.load_environment(path, size=SIZE)
+    way = np.asarray(cubemap.direction(size=SIZE)).reshape(-1, 3)[int(jnp.argmax(jnp.sum(light.radiance, -1)))]
+    assert abs(way[1] / edge.mean() - 1) > 0.2
+    found = np.asarray(relit.picture(light, samples=1))
+    np.testing.assert_allclose(found[10:16, 10:16], irradiance / np.pi, rtol=0.02)
+
+
 def test_lights_without_bright_texels_trace_nothing(relit):
     even = Environment(jnp.full((6, SIZE, SIZE, 3), 0.7))
     view = relit.picture_view()
