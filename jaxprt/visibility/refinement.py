@@ -346,7 +346,8 @@ class _Surface:
 
         Only shared vertices tell the sides apart. Rays start on that of the normal, whatever touches the sheet there.
         """
-        out = np.cross(*(self.position[self.face[triangle, k]].astype(np.float64) - place for k in (0, 1)))
+        one, other = (self.position[self.face[triangle, corner]].astype(np.float64) - place for corner in (0, 1))
+        out = np.cross(one, other)
         out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), np.finfo(np.float64).tiny)
         out *= np.where(np.sum(out * normal, 1, keepdims=True) < 0, -1, 1)
         return self._tracer.at_points(place + self.offset[triangle, None] * out, normal, out)
