@@ -167,17 +167,17 @@ def _gray(share: Float[np.ndarray, "h w s *c"]) -> Float[np.ndarray, "h w s"]:
     return share if share.ndim == 3 else share.mean(-1)
 
 
-def _chunk(count, face, place, own, through, triangle, depth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _chunk(count, face, place, cover, through, triangle, depth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Triangles, depths and shares [k, n, c] of the surfaces on some rays, with those behind all layers.
 
     Args:
-        count: Number of layers on each ray.
-        face: Their triangles.
-        place: Their depths.
-        own: Share of a view of each layer that shows the layer itself.
-        through: Share that shows what is behind it, for each color.
-        triangle: What is behind all layers of each ray.
-        depth: Its depth.
+        count: Number of translucent layers on each ray.
+        face: Triangle of each layer.
+        place: Distance of each layer along the view axis.
+        cover: Share of a view of each layer that shows the layer itself.
+        through: Share that shows what is behind the layer, for each color.
+        triangle: The opaque triangle behind the layers of each ray; -1 for none.
+        depth: Distance of that triangle along the view axis.
     """
     listed = np.arange(face.shape[1]) < count[:, None]
     left = np.cumprod(np.where(listed[..., None], through, 1), 1)
@@ -187,7 +187,7 @@ def _chunk(count, face, place, own, through, triangle, depth) -> tuple[np.ndarra
     triangles, depths = np.full((len(count), width), -1, np.int32), np.full((len(count), width), np.inf, np.float32)
     shares = np.zeros((len(count), width, left.shape[2]), np.float32)
     triangles[:, :-1], depths[:, :-1] = np.where(listed, face, -1), np.where(listed, place, np.inf)
-    shares[:, :-1] = np.where(listed[..., None], before * own[..., None], 0)
+    shares[:, :-1] = np.where(listed[..., None], before * cover[..., None], 0)
     triangles[rows, ends], depths[rows, ends] = triangle, depth
     shares[rows, ends] = np.where(count[:, None] > 0, left[rows, np.maximum(count - 1, 0)], 1)
     # Nothing is seen behind what hides everything.

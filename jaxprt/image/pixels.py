@@ -175,12 +175,14 @@ def resolve(
 
 
 def by_color(share: Any, colors: int, *, axes: int = 1) -> Any:
-    """Shares of points or pixels with an axis of colors: their own, or one for all; the mean for other numbers of them.
+    """Shares of points or pixels with a last axis that broadcasts to the colors of a picture.
+
+    Shares without colors get an axis of one. Shares of three colors are averaged if the picture has another number.
 
     Args:
-        share: Shares, with an axis of colors or without.
+        share: Shares [p] or [h w], with an axis of colors or without.
         colors: Number of colors of the picture.
-        axes: Number of axes without that of colors.
+        axes: Number of axes of the shares besides that of colors: 1 for points, 2 for pixels.
     """
     if share.ndim == axes:
         return share[..., None]

@@ -112,7 +112,7 @@ def test_the_canvas_shows_what_python_draws(hand, systems, lights):
     hand.page.locator("canvas.canvas").focus()
     hand.still()
     off = np.abs(hand.pixels() - drawn(hand, systems, lights)).max(-1)
-    assert np.quantile(off, 0.99) < 2.5 / 255  # Rays of a few pixels pass an edge on the other side.
+    assert np.quantile(off, 0.997) < 2.5 / 255  # Rays of a few pixels pass an edge on the other side.
     assert np.mean(off) < 0.5 / 255
 
 

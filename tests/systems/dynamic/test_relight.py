@@ -107,7 +107,7 @@ def test_terms_carry_what_there_are_no_lobes_for(mesh, fixed, light):
 
 
 def test_terms_of_the_remainder_change_little(mesh, transport, family, fixed, light):
-    """They are by a wavelet transport what lobes leave by their own: the error was 0.85 times that of lobes alone."""
+    """They are by a wavelet transport what lobes leave by their own: the error was 0.83 times that of lobes alone."""
     members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in ROUGH]
     more = dynamic.factor(members, family.lobe, ranks=(3, 12, 12), resolution=16)
     matter = dynamic.Material(jnp.array([0.0, 1.0, 0.0]), jnp.zeros(1), jnp.ones(1))
@@ -121,7 +121,7 @@ def test_terms_of_the_remainder_change_little(mesh, transport, family, fixed, li
     ):
         color = np.asarray(dynamic.radiance(made, [each, fixed], [matter, None], light, eye=EYE))
         error.append(relative(color[ball], exact))
-    assert 0.8 * error[0] < error[1] < 1.15 * error[0]
+    assert 0.82 * error[0] < error[1] < 1.15 * error[0]
 
 
 def test_a_texture_on_the_diffuse_part(mesh, transport, family, fixed, line, light):
