@@ -632,6 +632,22 @@ EXAMPLES = {
             brdf.CoatedModel(brdf.GGX(draw.uniform(3), draw.uniform(2)), transmits=True), draw.upper(5), draw.upper(5)
         ),
     ),
+    "brdf.sheen.Charlie": example(lambda draw: call(brdf.Charlie(draw.uniform()), draw.upper(5), draw.upper(5))),
+    "brdf.sheen.UnderSheen": example(
+        lambda draw: call(
+            brdf.UnderSheen(brdf.GGX(draw.uniform(3), draw.uniform(2)), draw.uniform()), draw.upper(5), draw.upper(5)
+        ),
+    ),
+    "brdf.sheen.sheen_albedo": example(lambda draw: call(draw.uniform(5), draw.uniform(5))),
+    "brdf.sheen.Sheen": example(
+        lambda draw: call(
+            brdf.Sheen(
+                brdf.MetallicRoughness(draw.uniform(3), draw.uniform(), draw.uniform()), draw.uniform(3), draw.uniform()
+            ),
+            draw.upper(5),
+            draw.upper(5),
+        ),
+    ),
     "brdf.models.Lambert": example(
         lambda draw: call(brdf.Lambert(draw.uniform(3)), draw.upper(5), draw.upper(5)),
         gradient=("self",),  # The value is the same for all directions.

@@ -1,6 +1,6 @@
 """BRDFs: analytic models, measured data, and families of BRDFs."""
 
-from jaxprt.brdf import coat, cylinders, fitted, measured, microfacet, models, navigation, scattered
+from jaxprt.brdf import coat, cylinders, fitted, measured, microfacet, models, navigation, scattered, sheen
 from jaxprt.brdf.coat import ClearCoat, CoatedModel, coat_reflectance
 from jaxprt.brdf.cylinders import PoulinFournier, PoulinFournierGrooves
 from jaxprt.brdf.fitted import load_lafortune, load_ngan
@@ -17,11 +17,13 @@ from jaxprt.brdf.models import (
     WardDuer,
 )
 from jaxprt.brdf.scattered import load_scattered
+from jaxprt.brdf.sheen import Charlie, Sheen, UnderSheen, sheen_albedo
 
 __all__ = [
     "GGX",
     "AshikhminShirley",
     "BlinnPhong",
+    "Charlie",
     "ClearCoat",
     "CoatedModel",
     "CookTorrance",
@@ -33,6 +35,8 @@ __all__ = [
     "PoulinFournier",
     "PoulinFournierGrooves",
     "SchlickDiffuse",
+    "Sheen",
+    "UnderSheen",
     "Ward",
     "WardDuer",
     "coat",
@@ -49,4 +53,6 @@ __all__ = [
     "models",
     "navigation",
     "scattered",
+    "sheen",
+    "sheen_albedo",
 ]

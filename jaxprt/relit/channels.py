@@ -3,7 +3,7 @@
 A metallic-roughness material is a sum of four fixed gray BRDFs whose weights are textures; see
 `jaxprt.brdf.MetallicRoughness.terms`. The fixed BRDFs are the channels of one BRDF, whose table over roughness all
 such materials share (`jaxprt.systems.standard`). An ideally diffuse material has one channel and no table. Parts of one
-`Kind` can share a system. A clear coat adds five channels, and the roughness of the coat as a second parameter.
+`Kind` can share a system. A clear coat or a sheen adds five channels, and its roughness as a second parameter.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxprt.brdf import BlinnPhong, ClearCoat, Lambert, MetallicRoughness, grid
+from jaxprt.brdf import BlinnPhong, ClearCoat, Lambert, MetallicRoughness, Sheen, grid
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import jit, known
 from jaxprt.scene import Mesh, Part, material_table
@@ -28,7 +28,7 @@ from jaxprt.scene.points import Points
 from jaxprt.sphere import directions
 from jaxprt.systems import standard
 from jaxprt.systems.protocol import Blend
-from jaxprt.systems.standard import RoughnessFamily, StandardTable
+from jaxprt.systems.standard import LayeredTable, RoughnessFamily, StandardTable
 
 _STEP = 1.5  # largest ratio of neighboring tabulated roughnesses
 _EQUAL = 1e-3  # tolerance for equal roughness, anisotropy and normals
@@ -71,11 +71,16 @@ class Shading(eqx.Module):
         return isinstance(self.brdf, Lambert)
 
     @property
+    def layered(self) -> bool:
+        """Whether there is a clear coat or a sheen."""
+        return isinstance(self.table, standard.LayeredTable)
+
+    @property
     def smoothest(self) -> Any:
-        """Logarithm of the smallest roughness, as the standard table takes it: a tuple with that of the coat if any."""
+        """Logarithm of the smallest roughness, as the standard table takes it: with that of a layer if any."""
         assert self.blend is not None
         least = tuple(float(np.min(np.asarray(each))) for each in self.blend.parameter)
-        return least if self.table is standard.COATED else least[0]
+        return least if self.layered else least[0]
 
 
 class Appearance(eqx.Module):
@@ -100,8 +105,8 @@ def blend(look: Look, term: tuple[int, ...], scale: Float[Array | np.ndarray, " 
         varies: Whether the system takes the roughness of each point.
     """
     weight = look.coefficient[:, np.asarray(term)] / scale[:, None]
-    if term == standard.COATED.term:
-        return Blend(weight, (look.log_roughness, look.log_coat))
+    if term == standard.layered.TERM:
+        return Blend(weight, (look.log_roughness, look.log_layer))
     return Blend(weight, (look.log_roughness,) if varies else ())
 
 
@@ -138,12 +143,12 @@ def of_part(part: Part, *, look: Look | None = None, takes: Callable[[StandardTa
     mesh, anisotropy = _framed(part)
     emitted = look.emitted if np.any(look.emitted) else None
     if look.coefficient.shape[1] > len(_NAMES) and np.any(look.coefficient[:, -1]):
-        table = standard.COATED
+        table = _table_of_layer(part)
         if anisotropy <= _EQUAL and takes(table):
-            exact = PerVertex(_coated(look))
+            exact = PerVertex(_layered(look, table))
             own = blend(look, table.term, table.scale, varies=True)
             return Shading(mesh, table.family, exact, table.knots, own, emitted, table.term, table.scale, table)
-        look = _without_coat(part.name, look)
+        look = _without_layer(part.name, look, table)
     exact = PerVertex(_metallic(look, anisotropy))
     needed = tuple(k for k in range(len(_NAMES)) if np.any(look.coefficient[:, k])) or _BARE
     if needed == _BARE:
@@ -197,14 +202,22 @@ def _look(part: Part) -> Look:
 
 
 def rough(material: Any) -> Any:
-    """A material of the same roughness as another, with everything else as by default."""
+    """A material of the same roughness and layer as another, with everything else as by default."""
     if not isinstance(material, TexturedMaterial):
         return material
+    layer: dict[str, Any] = {}
+    if material_table.may_be(material.clearcoat):
+        layer["clearcoat"] = 1.0
+    elif material_table.may_be(material.sheen_color):
+        layer["sheen_color"] = 1.0
     return TexturedMaterial(
         roughness=material.roughness,
         roughness_texture=material.roughness_texture,
         clearcoat_roughness=material.clearcoat_roughness,
         clearcoat_roughness_texture=material.clearcoat_roughness_texture,
+        sheen_roughness=material.sheen_roughness,
+        sheen_roughness_texture=material.sheen_roughness_texture,
+        **layer,
         **_normal_map(material),
     )
 
@@ -223,17 +236,38 @@ def _metallic(look: Look, anisotropy: Any) -> MetallicRoughness:
     return MetallicRoughness(**values, anisotropy=zero + anisotropy, rotation=zero)
 
 
-def _coated(look: Look) -> ClearCoat:
-    """The BRDF of each vertex or point of a part with a clear coat."""
-    assert look.log_coat is not None
-    coat = look.coefficient[:, -1, 0]
-    return ClearCoat(_metallic(look, 0.0), coat, jnp.exp(look.log_coat))
+def _table_of_layer(part: Part) -> LayeredTable:
+    """The tables of a part with a clear coat or a sheen. With a coat it loses its sheen, with a warning."""
+    material = part.material
+    assert isinstance(material, TexturedMaterial)
+    if not material_table.may_be(material.clearcoat):
+        return standard.SHEENED
+    if material_table.may_be(material.sheen_color):
+        warnings.warn(f"the sheen of part {part.name!r} is left out: it has a clear coat", stacklevel=3)
+    return standard.COATED
 
 
-def _without_coat(name: str, look: Look) -> Look:
-    """The materials without their clear coats, with a warning."""
+def _layered(look: Look, table: LayeredTable) -> ClearCoat | Sheen:
+    """The BRDF of each vertex or point of a part with a clear coat or a sheen."""
+    assert look.log_layer is not None
+    layer, roughness = look.coefficient[:, -1], jnp.exp(look.log_layer)
+    if table is standard.COATED:
+        return ClearCoat(_metallic(look, 0.0), layer[:, 0], roughness)
+    return Sheen(_metallic(look, 0.0), layer, roughness)
+
+
+def _model(look: Look, shading: Shading) -> Any:
+    """The BRDF of each vertex or point of a part."""
+    if isinstance(shading.table, standard.LayeredTable):
+        return _layered(look, shading.table)
+    return _metallic(look, _anisotropy(shading))
+
+
+def _without_layer(name: str, look: Look, table: LayeredTable) -> Look:
+    """The materials without their clear coats or sheens, with a warning."""
+    layer = "clear coat" if table is standard.COATED else "sheen"
     warnings.warn(
-        f"the clear coat of part {name!r} is left out: anisotropic materials, and systems without the standard tables, "
+        f"the {layer} of part {name!r} is left out: anisotropic materials, and systems without the standard tables, "
         "have none",
         stacklevel=3,
     )
@@ -277,12 +311,16 @@ def appearance(
 def replaced(part: Part, shading: Shading, material: TexturedMaterial | BlinnPhong) -> Part:
     """The part with a new material. Refuses materials that its system cannot have; `appearance` gives the errors."""
     shiny = shading.table is standard.BLINN_PHONG
-    coat = 0.0 if isinstance(material, BlinnPhong) else material.clearcoat
-    if shading.table is not standard.COATED and not isinstance(coat, Tracer) and float(coat):
-        raise ValueError(
-            f"part {part.name!r} was precomputed without a clear coat, got a material with one of weight "
-            f"{float(coat):g}: precompute it with a coat, of a weight of 1e-6 at least"
-        )
+    for table, name, layer in (
+        (standard.COATED, "clearcoat", "clear coat"),
+        (standard.SHEENED, "sheen_color", "sheen"),
+    ):
+        value = getattr(material, name, 0.0)
+        if shading.table is not table and not isinstance(value, Tracer) and np.any(value):
+            raise ValueError(
+                f"part {part.name!r} was precomputed without a {layer}, got a material with {name}={value}: "
+                f"precompute it with a {layer}, of a {name} of 1e-6 at least"
+            )
     if isinstance(material, BlinnPhong) != shiny:
         kind = "BlinnPhong" if shiny else "TexturedMaterial"
         raise TypeError(f"the material of part {part.name!r} must be a {kind}, got {type(material).__name__}")
@@ -337,8 +375,7 @@ def materials_at(parts: Sequence[Part], shading: Shading, points: Points) -> tup
         values = look.values
         exponent = 2 / values.roughness**2 - 2
         return own, PerVertex(BlinnPhong(values.base_color, values.specular_color, exponent))
-    coated = shading.table is standard.COATED
-    return own, PerVertex(_coated(look) if coated else _metallic(look, _anisotropy(shading)))
+    return own, PerVertex(_model(look, shading))
 
 
 def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Array | np.ndarray | None, Points]:
@@ -350,9 +387,7 @@ def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Ar
     if not isinstance(part.material, TexturedMaterial):
         return shading.exact, None, points
     look = material_table.of_parts([part]).at(points)
-    coated = shading.table is standard.COATED
-    brdf = PerVertex(_coated(look) if coated else _metallic(look, _anisotropy(shading)))
-    return brdf, look.emitted, points.tilted(look.normal)
+    return PerVertex(_model(look, shading)), look.emitted, points.tilted(look.normal)
 
 
 def _fits(name: str, shading: Shading, look: Look) -> Any:
@@ -425,7 +460,7 @@ def _check_frames(part: Part, shading: Shading, new: Part) -> None:
 
 def _anisotropy(shading: Shading) -> float:
     """The anisotropy that a part was precomputed with."""
-    if shading.table is standard.COATED:
+    if shading.layered:
         return 0.0
     assert isinstance(shading.exact, PerVertex)
     assert isinstance(shading.exact.model, MetallicRoughness)

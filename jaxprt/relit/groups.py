@@ -467,7 +467,7 @@ def look_at(table: MaterialTable, rough: MaterialTable | None, points: Points) -
         return look
     with compile_time(rough, points):
         plain = rough.at(points)
-    return look._replace(log_roughness=plain.log_roughness, log_coat=plain.log_coat)
+    return look._replace(log_roughness=plain.log_roughness, log_layer=plain.log_layer)
 
 
 @jit

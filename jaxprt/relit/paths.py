@@ -61,7 +61,7 @@ def factored(shading: Shading) -> Path:
 
 @functools.cache
 def _standard(table: StandardTable) -> Path:
-    if table in (standard.METALLIC_ROUGHNESS, standard.COATED):
+    if table is not standard.BLINN_PHONG:
         return Path(*table.paths())
     return _factored(table.family, table.family, table.knots)
 

@@ -13,7 +13,7 @@ from jaxprt import require
 from jaxprt.compile import jit
 from jaxprt.scene import texture
 
-_COLORS = "base_color", "emissive", "specular_color"
+_COLORS = "base_color", "emissive", "specular_color", "sheen_color"
 ALPHA_MODES = "opaque", "mask", "blend"
 BACKS = "black", "hidden", "lit"
 
@@ -126,6 +126,9 @@ class TexturedMaterial(eqx.Module):
         normal_texture: Normal map [h w 3], as (normal + 1) / 2 in the frame of tangent, bitangent and normal.
         clearcoat: Weight of a clear coat, from 0 to 1; see KHR_materials_clearcoat and `jaxprt.brdf.ClearCoat`.
         clearcoat_roughness: Perceptual roughness of the coat, from 0 to 1.
+        sheen_color: Linear color of a sheen, from 0 to 1; see KHR_materials_sheen and `jaxprt.brdf.Sheen`. A material
+            with a clear coat has no sheen.
+        sheen_roughness: Perceptual roughness of the sheen, from 0 to 1; smaller ones count as 0.1.
         transmission: Fraction of the light under the surface that passes through in place of being reflected
             diffusely, from 0 to 1; see KHR_materials_transmission. Surfaces are thin: light and views pass straight
             through, less what is reflected at normal incidence. Views are tinted by the mean base color, light is
@@ -133,6 +136,8 @@ class TexturedMaterial(eqx.Module):
         clearcoat_texture: Texture [h w 1] that multiplies `clearcoat`.
         clearcoat_roughness_texture: Texture [h w 1] that multiplies `clearcoat_roughness`.
         transmission_texture: Texture [h w 1] that multiplies `transmission`.
+        sheen_color_texture: Texture [h w 3] that multiplies the color of the sheen.
+        sheen_roughness_texture: Texture [h w 1] that multiplies `sheen_roughness`.
         alpha: Opacity, from 0 for a surface that is not there to 1. Ignored if `alpha_mode` is "opaque".
         alpha_texture: Texture [h w 1] that multiplies `alpha`.
         alpha_cutoff: Opacity from which on a surface is there, for "mask"; at least 0. It is absent below.
@@ -146,8 +151,8 @@ class TexturedMaterial(eqx.Module):
         ValueError: A factor is not finite or out of its range, or `alpha_mode` or `back` is another word.
 
     Reference: Khronos glTF 2.0 specification, section 3.9 and appendix B; its extensions KHR_materials_ior,
-    KHR_materials_specular, KHR_materials_anisotropy, KHR_materials_emissive_strength, KHR_materials_clearcoat and
-    KHR_materials_transmission.
+    KHR_materials_specular, KHR_materials_anisotropy, KHR_materials_emissive_strength, KHR_materials_clearcoat,
+    KHR_materials_sheen and KHR_materials_transmission.
     """
 
     base_color: Float[Array, "3"] = eqx.field(converter=_color, default=1.0)
@@ -174,6 +179,10 @@ class TexturedMaterial(eqx.Module):
     clearcoat_texture: Texture | None = None
     clearcoat_roughness_texture: Texture | None = None
     transmission_texture: Texture | None = None
+    sheen_color: Float[Array, "3"] = eqx.field(converter=_color, default=0.0)
+    sheen_roughness: Float[Array, ""] = eqx.field(converter=_scalar, default=0.0)
+    sheen_color_texture: Texture | None = None
+    sheen_roughness_texture: Texture | None = None
     alpha: Float[Array, ""] = eqx.field(converter=_scalar, default=1.0)
     alpha_texture: Texture | None = None
     alpha_cutoff: Float[Array, ""] = eqx.field(converter=_scalar, default=0.5)
@@ -187,7 +196,7 @@ class TexturedMaterial(eqx.Module):
                 raise ValueError(
                     f"{name} of TexturedMaterial must be one of {', '.join(words)}, got {getattr(self, name)!r}"
                 )
-        layers = "clearcoat", "clearcoat_roughness", "transmission"
+        layers = "clearcoat", "clearcoat_roughness", "transmission", "sheen_color", "sheen_roughness"
         for name in ("base_color", "metallic", "roughness", "specular", "anisotropy", "alpha", *layers):
             require.within(f"{name} of TexturedMaterial", getattr(self, name), 0, 1)
         for name in ("emissive", "specular_color", "ior", "alpha_cutoff"):

@@ -15,7 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxprt.brdf import BlinnPhong, MetallicRoughness
+from jaxprt.brdf import BlinnPhong, MetallicRoughness, sheen
 from jaxprt.compile import kept, known, put, shared_size
 from jaxprt.scene import mipmap, normal_maps, texture
 from jaxprt.scene.material import Texture, TexturedMaterial
@@ -35,7 +35,13 @@ TEXTURES = (
     "normal_texture",
 )
 # Textures of materials with further layers, which only scenes with such materials have columns for.
-LAYER_TEXTURES = ("clearcoat_texture", "clearcoat_roughness_texture", "transmission_texture")
+LAYER_TEXTURES = (
+    "clearcoat_texture",
+    "clearcoat_roughness_texture",
+    "transmission_texture",
+    "sheen_color_texture",
+    "sheen_roughness_texture",
+)
 COLORS = 6  # of these determine the colors and the roughness of points; the others turn their frames
 _NORMAL = TEXTURES.index("normal_texture")
 _FACTORS = (
@@ -48,7 +54,14 @@ _FACTORS = (
     ("ior", 1),
 )
 _SHINY = sum(width for _, width in _FACTORS)  # column that is 1 for `BlinnPhong`
-_LAYERS = ("clearcoat", "clearcoat_roughness", "transmission")  # columns after it, in scenes that have them
+# Columns after it, in scenes that have them, in the order of their textures.
+_LAYERS = (
+    ("clearcoat", 1),
+    ("clearcoat_roughness", 1),
+    ("transmission", 1),
+    ("sheen_color", 3),
+    ("sheen_roughness", 1),
+)
 ROW = 1 << 12  # number of points that are evaluated together
 SMOOTHEST = 1e-3**0.5  # smaller roughness is treated as this one
 # Edge of what a look-up averages, in pixels: mip maps and interpolation within and between them average about as much
@@ -73,18 +86,28 @@ class Values(NamedTuple):
     ior: Float[Array | np.ndarray, " p"]
 
 
+class Layers(NamedTuple):
+    """Parameters of layers at points; `jaxprt.scene.TexturedMaterial` explains them."""
+
+    clearcoat: Float[Array, " p"]
+    clearcoat_roughness: Float[Array, " p"]
+    transmission: Float[Array, " p"]
+    sheen_color: Float[Array, "p 3"]
+    sheen_roughness: Float[Array, " p"]
+
+
 class Look(NamedTuple):
     """What systems need of the materials at points.
 
     Attributes:
         coefficient: Weights of the four terms of `jaxprt.brdf.MetallicRoughness`. Those of `BlinnPhong` are its colors:
-            diffuse, specular, 0 and 0. In scenes with layers these are followed by the weights under a clear coat
-            and by that of the coat, as `jaxprt.systems.standard.coated` has them; without a coat the first four are
-            those of the material.
+            diffuse, specular, 0 and 0. In scenes with layers these are followed by the weights under a clear coat or
+            a sheen and by that of the layer, as `jaxprt.systems.standard.layered` has them; without a layer the first
+            four are those of the material.
         log_roughness: Logarithm of the roughness; that of metallic-roughness materials is at least `SMOOTHEST`.
         emitted: Radiance that the surface emits.
         values: The parameters themselves.
-        log_coat: Logarithm of the roughness of the clear coat; None in scenes without layers.
+        log_layer: Logarithm of the roughness of the layer; None in scenes without layers.
         normal: Unit shading normals in world space, tilted by normal maps; None in scenes without such maps. Roughness
             includes the variance of the map's normals over a pixel.
     """
@@ -93,7 +116,7 @@ class Look(NamedTuple):
     log_roughness: Float[Array | np.ndarray, " p"]
     emitted: Float[Array | np.ndarray, "p 3"]
     values: Values
-    log_coat: Float[Array | np.ndarray, " p"] | None = None
+    log_layer: Float[Array | np.ndarray, " p"] | None = None
     normal: Float[Array | np.ndarray, "p 3"] | None = None
 
 
@@ -149,7 +172,7 @@ class MaterialTable(eqx.Module):
 
     @property
     def layered(self) -> bool:
-        """Whether it has columns for layers: clear coats and transmission."""
+        """Whether it has columns for layers: clear coats, sheens and transmission."""
         return self.image.shape[1] > len(TEXTURES)
 
     def at(self, points: Points) -> Look:
@@ -187,7 +210,9 @@ def _looked(table: MaterialTable, points: Points) -> Look:
     if table.frame is not None:
         normal, variance = _normals(table, points)
         values = values._replace(roughness=normal_maps.rougher(values.roughness, variance))
-        layers = layers and (layers[0], normal_maps.rougher(layers[1], variance), layers[2])
+        layers = layers and layers._replace(
+            clearcoat_roughness=normal_maps.rougher(layers.clearcoat_roughness, variance)
+        )
     shiny = table.factor[:, _SHINY][table.part[points.corner[0]]] > 0
     none = jnp.zeros_like(values.base_color)
     colors = jnp.stack([values.base_color, values.specular_color, none, none], 1)
@@ -195,19 +220,28 @@ def _looked(table: MaterialTable, points: Points) -> Look:
     coefficient = jnp.where(shiny[:, None, None], colors, material.coefficient())
     least = jnp.where(shiny, 0, SMOOTHEST)
     look = Look(coefficient, jnp.log(jnp.maximum(values.roughness, least)), values.emissive, values, normal=normal)
-    return look if layers is None else _layered(look, *layers)
+    if layers is None:
+        return look
+    coated = table.factor[:, _SHINY + 1][table.part[points.corner[0]]] > 0
+    return _layered(look, layers, coated)
 
 
-def _layered(look: Look, coat: Array, roughness: Array, transmission: Array) -> Look:
-    """The materials with their layers: what is under a clear coat, and less diffuse light where light passes."""
-    passing = jnp.stack([1 - transmission, jnp.ones_like(coat), jnp.ones_like(coat), 1 - transmission], 1)[..., None]
-    base, coat = look.coefficient * passing, coat[:, None, None]
-    above = jnp.broadcast_to(coat, (len(coat), 1, 3))
-    coefficient = jnp.concatenate([(1 - coat) * base, coat * base, above], 1)
-    return look._replace(coefficient=coefficient, log_coat=jnp.log(jnp.maximum(roughness, SMOOTHEST)))
+def _layered(look: Look, layers: Layers, coated: Bool[Array, " p"]) -> Look:
+    """The materials with their layers: what is under a coat or a sheen, and less diffuse light where light passes."""
+    coat, passing = layers.clearcoat, 1 - layers.transmission
+    base = look.coefficient * jnp.stack([passing, jnp.ones_like(coat), jnp.ones_like(coat), passing], 1)[..., None]
+    color = jnp.where(coated[:, None], 0, layers.sheen_color)
+    weight = (coat + jnp.max(color, 1))[:, None, None]
+    coefficient = jnp.concatenate([(1 - weight) * base, weight * base, (coat[:, None] + color)[:, None]], 1)
+    roughness = jnp.where(
+        jnp.any(color > 0, 1),
+        jnp.maximum(layers.sheen_roughness, sheen.SMOOTHEST),
+        jnp.maximum(layers.clearcoat_roughness, SMOOTHEST),
+    )
+    return look._replace(coefficient=coefficient, log_layer=jnp.log(roughness))
 
 
-def _values(table: MaterialTable, points: Points) -> tuple[Values, tuple[Array, ...] | None]:
+def _values(table: MaterialTable, points: Points) -> tuple[Values, Layers | None]:
     """The parameters at points, and those of their layers; None in scenes without."""
     factor = table.factor[table.part[points.corner[0]]]
     read = partial(_read, table, points, _coordinates(table, points))
@@ -215,7 +249,12 @@ def _values(table: MaterialTable, points: Points) -> tuple[Values, tuple[Array, 
     layers = None
     if table.layered:
         scale = jax.lax.map(read, len(TEXTURES) + jnp.arange(len(_LAYERS)))
-        layers = tuple(factor[:, _SHINY + 1 + row] * scale[row, :, 0] for row in range(len(_LAYERS)))
+        begin, each = _SHINY + 1, []
+        for texel, (_, width) in zip(scale, _LAYERS, strict=True):
+            value = factor[:, begin : begin + width] * texel[:, :width]
+            each.append(value if width > 1 else value[:, 0])
+            begin += width
+        layers = Layers(*each)
     color = points.carry(table.color)
     first = np.cumsum([0, *(width for _, width in _FACTORS)])
     each = {name: factor[:, begin : begin + width] for (name, width), begin in zip(_FACTORS, first, strict=False)}
@@ -432,11 +471,15 @@ def with_materials(
 
 
 def has_layers(material: Any) -> bool:
-    """Whether a material has a clear coat or lets light pass. Values that JAX traces may be anything."""
+    """Whether a material has a clear coat or a sheen or lets light pass. Values that JAX traces may be anything."""
     if not isinstance(material, TexturedMaterial):
         return False
-    layers = (material.clearcoat, material.transmission)
-    return any(isinstance(each, Tracer) or bool(np.asarray(each) != 0) for each in layers)
+    return any(may_be(each) for each in (material.clearcoat, material.transmission, material.sheen_color))
+
+
+def may_be(value: Any) -> bool:
+    """Whether a factor is not 0; true for one that JAX traces."""
+    return isinstance(value, Tracer) or bool(np.any(np.asarray(value) != 0))
 
 
 def _key(name: str, each: Texture) -> tuple[int, bool]:
@@ -507,9 +550,9 @@ def _factors(material: TexturedMaterial | Callable, layered: bool) -> Any:
     if isinstance(material, BlinnPhong):
         colors = {"base_color": material.diffuse, "specular_color": material.specular}
         factor: dict[str, Any] = vars(textured) | colors | {"roughness": xp.sqrt(2 / (material.exponent + 2))}
-        rest = [0] * len(_LAYERS) if layered else []
+        rest = [0] * sum(width for _, width in _LAYERS) if layered else []
         return xp.hstack([*(xp.broadcast_to(factor[name], (width,)) for name, width in _FACTORS), 1, *rest])
-    rest = [getattr(textured, name) for name in _LAYERS] if layered else []
+    rest = [getattr(textured, name) for name, _ in _LAYERS] if layered else []
     return xp.hstack([*(getattr(textured, name) for name, _ in _FACTORS), 0, *rest])
 
 

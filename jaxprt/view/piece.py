@@ -20,11 +20,11 @@ from jaxprt.scene import Environment
 from jaxprt.sphere import cubemap
 from jaxprt.systems import harmonic, lobe
 from jaxprt.view import matrices, messages, parts, stages
+from jaxprt.view.bases import without_layers
 from jaxprt.view.messages import Reply
 from jaxprt.view.reduced import bits_of, coarse, light_size, resized, scale_of, systems_of
 from jaxprt.view.server import MODULE
 from jaxprt.view.session import Session
-from jaxprt.view.uncoated import without_coats
 
 _MOST_BITS = 2**27  # largest buffer for the visibility of single texels, in bytes, that graphics cards accept
 _SKY_ROWS, _LEAST_SKY_ROWS = 1024, 128  # most rows of a picture of a light; at 128 texels are as good
@@ -85,7 +85,7 @@ def export(
     bytes. Other parts use lobes and averaged visibility. All are stored as finely as `most` permits. If they fit, the
     brightest texels of the light are summed one by one on the parts that support it. As in the viewer, the user can
     rotate or replace the light, add lamps, and change materials that are constant over a part. A Radiance HDR file that
-    is dropped on the page becomes a light. Clear coats are left out, with a warning.
+    is dropped on the page becomes a light. Clear coats and sheens are left out, with a warning.
 
     Args:
         scene: The result of `jaxprt.precompute`, with the systems "lobe" and "harmonic".
@@ -95,7 +95,7 @@ def export(
 
     Returns:
         A description of the page, with its size and its error against the scene. If the scene has bounces, the error
-        includes that they are missing in the page, and so it does with clear coats.
+        includes that they are missing in the page, and so it does with clear coats and sheens.
 
     Raises:
         TypeError: `scene` is not a relit scene, `path` is not a path, `most` is not a number, or `environments` holds
@@ -110,7 +110,7 @@ def export(
     scene = scene.centered()
     session = Session(scene, environments=environments)
     lights = dict(zip(session.stages.name, session.stages.lights, strict=True))
-    bare = without_coats(scene)
+    bare = without_layers(scene)
     bits = bits_of(bare)
     # Sharp shadows of a small sun matter more than finely averaged visibility.
     fits = bits is not None and sum(each.size for each in bits if each is not None) <= _MOST_BITS

@@ -10,7 +10,7 @@ _COMPRESSION = {DRACO, *gltf_meshopt.NAMES, "KHR_texture_basisu", "EXT_texture_w
 HONORED = {
     *(
         f"KHR_materials_{name}"
-        for name in ("ior", "specular", "anisotropy", "emissive_strength", "clearcoat", "transmission")
+        for name in ("ior", "specular", "anisotropy", "emissive_strength", "clearcoat", "sheen", "transmission")
     ),
     "KHR_texture_transform",
     "KHR_mesh_quantization",

@@ -48,21 +48,15 @@ class MaterialReader:
         owner = f"material {index}"
         item = self._document.item("materials", index, owner)
         extensions = self._document.object(item, "extensions", owner)
-        ior, specular, brushed, emissive, coat, passing = (
+        ior, specular, brushed, emissive = (
             self._document.object(extensions, f"KHR_materials_{name}", owner)
-            for name in ("ior", "specular", "anisotropy", "emissive_strength", "clearcoat", "transmission")
+            for name in ("ior", "specular", "anisotropy", "emissive_strength")
         )
         pbr = self._document.object(item, "pbrMetallicRoughness", owner)
         glow = self._number(item, "emissiveFactor", (0.0, 0.0, 0.0), owner)
         glow = glow * self._number(emissive, "emissiveStrength", 1.0, owner)
         normal = self._document.object(item, "normalTexture", owner)
         self._note(item, owner)
-        if "clearcoatNormalTexture" in coat:
-            self.ignored.add("normal maps of clearcoats (a coat has the normals of its base)")
-        if passing.get("transmissionFactor", 0) != 0:
-            self.ignored.add(
-                "refraction and blur of what is seen through transmitting surfaces (they are thin and clear)"
-            )
         field: dict[str, Any] = {
             "base_color": self._number(pbr, "baseColorFactor", (1.0, 1.0, 1.0, 1.0), owner)[:3],
             "metallic": self._number(pbr, "metallicFactor", 1.0, owner),
@@ -76,9 +70,6 @@ class MaterialReader:
             "anisotropy": self._number(brushed, "anisotropyStrength", 0.0, owner),
             "rotation": self._number(brushed, "anisotropyRotation", 0.0, owner),
             "normal_scale": self._number(normal, "scale", 1.0, owner),
-            "clearcoat": self._number(coat, "clearcoatFactor", 0.0, owner),
-            "clearcoat_roughness": self._number(coat, "clearcoatRoughnessFactor", 0.0, owner),
-            "transmission": self._number(passing, "transmissionFactor", 0.0, owner),
         }
         colors = (0, 1, 2)
         field |= {
@@ -90,10 +81,8 @@ class MaterialReader:
             "specular_color_texture": self._texture(specular, "specularColorTexture", colors, owner, decoded=True),
             "anisotropy_texture": self._texture(brushed, "anisotropyTexture", colors, owner),
             "normal_texture": self._texture(item, "normalTexture", colors, owner),
-            "clearcoat_texture": self._texture(coat, "clearcoatTexture", (0,), owner),
-            "clearcoat_roughness_texture": self._texture(coat, "clearcoatRoughnessTexture", (1,), owner),
-            "transmission_texture": self._texture(passing, "transmissionTexture", (0,), owner),
         }
+        field |= self._layers(extensions, owner)
         field |= self._cover(item, pbr, owner)
         try:
             return TexturedMaterial(**field)
@@ -102,6 +91,36 @@ class MaterialReader:
 
     def _number(self, item: dict[str, Any], key: str, default: float | tuple[float, ...], owner: str) -> np.ndarray:
         return self._document.numbers(item.get(key, default), np.shape(default), f"{key} of {owner}")
+
+    def _layers(self, extensions: dict[str, Any], owner: str) -> dict[str, Any]:
+        """The clear coat and the sheen of a material, and what passes through it."""
+        coat, fibers, passing = (
+            self._document.object(extensions, f"KHR_materials_{name}", owner)
+            for name in ("clearcoat", "sheen", "transmission")
+        )
+        if "clearcoatNormalTexture" in coat:
+            self.ignored.add("normal maps of clearcoats (a coat has the normals of its base)")
+        if passing.get("transmissionFactor", 0) != 0:
+            self.ignored.add(
+                "refraction and blur of what is seen through transmitting surfaces (they are thin and clear)"
+            )
+        field = {
+            "clearcoat": self._number(coat, "clearcoatFactor", 0.0, owner),
+            "clearcoat_roughness": self._number(coat, "clearcoatRoughnessFactor", 0.0, owner),
+            "sheen_color": self._number(fibers, "sheenColorFactor", (0.0, 0.0, 0.0), owner),
+            "sheen_roughness": self._number(fibers, "sheenRoughnessFactor", 0.0, owner),
+            "transmission": self._number(passing, "transmissionFactor", 0.0, owner),
+        }
+        if field["clearcoat"] and np.any(field["sheen_color"]):
+            self.ignored.add("sheens under clearcoats")
+            field["sheen_color"] = np.zeros(3, np.float32)
+        return field | {
+            "clearcoat_texture": self._texture(coat, "clearcoatTexture", (0,), owner),
+            "clearcoat_roughness_texture": self._texture(coat, "clearcoatRoughnessTexture", (1,), owner),
+            "sheen_color_texture": self._texture(fibers, "sheenColorTexture", (0, 1, 2), owner, decoded=True),
+            "sheen_roughness_texture": self._texture(fibers, "sheenRoughnessTexture", (3,), owner),
+            "transmission_texture": self._texture(passing, "transmissionTexture", (0,), owner),
+        }
 
     def _cover(self, item: dict[str, Any], pbr: dict[str, Any], owner: str) -> dict[str, Any]:
         """What a material hides: its alpha, and its back (sections 3.9.4 and 3.9.5).

@@ -50,13 +50,14 @@ def load_scene(
     Of a glTF file, this reads metallic-roughness materials with textures, normal maps, vertex colors, two sets of
     texture coordinates, alpha, double-sided materials, skins, morph targets, and perspective cameras, whose pictures
     are 512 pixels high. It supports the extensions KHR_materials_ior, _specular, _anisotropy, _emissive_strength,
-    _clearcoat and _transmission (thin glass), KHR_texture_transform, KHR_mesh_quantization and
+    _clearcoat, _sheen and _transmission (thin glass), KHR_texture_transform, KHR_mesh_quantization and
     EXT_mesh_gpu_instancing. Point lights and spots of KHR_lights_punctual become point lights of the scene. Its
     directional lights become suns, which `jaxprt.scene.with_suns` adds to an environment. Triangles without normals are
     flat. Compressed geometry and textures (Draco, meshoptimizer, KTX 2) are decoded by the packages of `jaxprt[web]`
     where they have no uncompressed fallback. A file that requires another extension is refused, unless it is one of
-    materials. A single warning names all other features of the file (sheen, orthographic cameras, images that cannot be
-    read, and so on). Primitives without material get the default material of the specification, a white rough metal.
+    materials. A single warning names all other features of the file (iridescence, orthographic cameras, images that
+    cannot be read, and so on). Primitives without material get the default material of the specification, a white rough
+    metal.
 
     Of an OBJ file, this reads the materials of its MTL files: Kd, Ks, Ns, Ke, map_Kd, map_Ke, norm, and the
     metallic-roughness statements Pr, Pm, map_Pr, map_Pm and Ni. `mtl.read` explains how Phong materials and those of

@@ -1,20 +1,24 @@
-"""Tables of the materials that most scenes have, fitted once and shipped: metallic-roughness and Blinn-Phong."""
+"""Tables of what most scenes have, fitted once and shipped: metallic-roughness, its layers, and Blinn-Phong."""
 
-from jaxprt.systems.standard import coated, families, tables
-from jaxprt.systems.standard.coated import COATED
-from jaxprt.systems.standard.families import RoughnessFamily, ShininessFamily
-from jaxprt.systems.standard.tables import BLINN_PHONG, DEGREE, METALLIC_ROUGHNESS, StandardTable, forget
+from jaxprt.systems.standard import families, layered, tables
+from jaxprt.systems.standard.families import RoughnessFamily, SheenFamily, ShininessFamily
+from jaxprt.systems.standard.layered import COATED, SHEENED, LayeredTable
+from jaxprt.systems.standard.tables import BLINN_PHONG, DEGREE, METALLIC_ROUGHNESS, SHEEN, StandardTable, forget
 
 __all__ = [
     "BLINN_PHONG",
     "COATED",
     "DEGREE",
     "METALLIC_ROUGHNESS",
+    "SHEEN",
+    "SHEENED",
+    "LayeredTable",
     "RoughnessFamily",
+    "SheenFamily",
     "ShininessFamily",
     "StandardTable",
-    "coated",
     "families",
     "forget",
+    "layered",
     "tables",
 ]

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxprt.brdf import BlinnPhong, Lambert, MetallicRoughness
+from jaxprt.brdf import BlinnPhong, Charlie, Lambert, MetallicRoughness
 from jaxprt.brdf.varying import Channels
 
 
@@ -39,3 +39,17 @@ class ShininessFamily(eqx.Module):
     def __call__(self, log_roughness: Float[Array, ""] | float) -> Channels:
         """The BRDF for the natural logarithm of a roughness, the square root of 2 / (exponent + 2)."""
         return Channels((Lambert(1.0), BlinnPhong(0.0, 1.0, 2 * jnp.exp(-2 * log_roughness) - 2)), self.scale)
+
+
+class SheenFamily(eqx.Module):
+    """Maps a roughness to the fibers of a sheen, as one channel.
+
+    Attributes:
+        scale: Factor of the channel.
+    """
+
+    scale: Float[Array, " k"]
+
+    def __call__(self, log_roughness: Float[Array, ""] | float) -> Channels:
+        """The BRDF for the natural logarithm of a roughness."""
+        return Channels((Charlie(jnp.exp(log_roughness)),), self.scale)

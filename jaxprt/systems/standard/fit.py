@@ -16,17 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxprt.brdf import MetallicRoughness
+from jaxprt.brdf import MetallicRoughness, sheen
 from jaxprt.brdf.varying import Channels
 from jaxprt.sphere import hemisphere
 from jaxprt.systems import bounces, bright_texels, harmonic, lobe
 from jaxprt.systems.bounces import traced
 from jaxprt.systems.lobe import LobeBrdf, em
 from jaxprt.systems.standard import descent, tables
-from jaxprt.systems.standard.families import RoughnessFamily, ShininessFamily
+from jaxprt.systems.standard.families import RoughnessFamily, SheenFamily, ShininessFamily
 
 COUNTS = (4, 8, 12, 24)  # numbers of lobes; others are fitted by who asks for them
-KNOTS = 20
+KNOTS, FEW = 20, 10  # FEW for lobes of sheens, which are wide
 STEPS = 1000  # of the descent
 ANGLES = 48  # view nodes of the harmonics
 BANDS = 128  # degree of the zonal harmonics from which curvatures are computed
@@ -51,20 +51,22 @@ class Material(NamedTuple):
         first: Roughness from which on descent improves the lobes.
         knot: Knots of the harmonics.
         power: Power of the roughness to which the width of lobes is proportional.
+        knots_in_all: Number of knots of everything but the harmonics.
     """
 
-    family: RoughnessFamily | ShininessFamily
+    family: RoughnessFamily | ShininessFamily | SheenFamily
     scale: np.ndarray
     smoothest: float
     weight: np.ndarray
     first: float
     knot: np.ndarray
     power: int
+    knots_in_all: int = KNOTS
 
     @property
     def knots(self) -> np.ndarray:
         """Knots of everything but the harmonics, evenly spaced in the logarithm of roughness."""
-        return np.linspace(np.log(self.smoothest), 0, KNOTS)
+        return np.linspace(np.log(self.smoothest), 0, self.knots_in_all)
 
 
 def material(name: str) -> Material:
@@ -76,6 +78,9 @@ def material(name: str) -> Material:
         # Every other one has no diffuse base.
         weight = np.concatenate([base * (np.arange(60) % 2)[:, None], other], 1) / scale
         return Material(ShininessFamily(jnp.asarray(scale)), scale, 10**-2.5, weight, 0.1, _spread(10**-2.5, 1), 1)
+    if name == "sheen":
+        scale, knot = np.ones(1, np.float32), _spread(sheen.SMOOTHEST, 1)
+        return Material(SheenFamily(jnp.asarray(scale)), scale, sheen.SMOOTHEST, base, sheen.SMOOTHEST, knot, 1, FEW)
     scale = np.array([0.1, 1.0, 1.0, 0.02], np.float32)
     metallic, specular = (
         np.resize(each, 60).astype(np.float32) for each in ([0, 0, 1, 1, 0.3, 0.6], [1, 0.6, 1, 1, 0.5])
@@ -123,7 +128,7 @@ def between(knot: np.ndarray) -> np.ndarray:
     return np.interp(np.arange(2 * len(knot) - 1) / 2, np.arange(len(knot)), knot)
 
 
-def errors(table: LobeBrdf, family: RoughnessFamily | ShininessFamily, places: np.ndarray) -> np.ndarray:
+def errors(table: LobeBrdf, family: RoughnessFamily | ShininessFamily | SheenFamily, places: np.ndarray) -> np.ndarray:
     """Error of a table at each of some roughnesses, under natural light, of the sum of all channels."""
     each = (jnp.asarray(place, table.scale.dtype) for place in places)
     return np.array([lobe.table.measured_error(family(place), table.at(place)) for place in each])
@@ -140,7 +145,17 @@ def harmonics(made: Material) -> dict[str, np.ndarray]:
 
 
 def columns(made: Material, table: LobeBrdf) -> dict[str, np.ndarray]:
-    """What does not follow the table: curvatures, numbers of samples, and albedos of the traced lobes, at the knots."""
+    """What does not follow the table: curvatures, numbers of samples, and albedos of the traced lobes, at the knots.
+
+    A sheen has no numbers of samples: it is dark around the mirror direction, where these are measured, and wide
+    elsewhere.
+    """
+    held = {
+        "zonal": np.stack([_zonal(made.family(jnp.asarray(each))) for each in made.knots]).astype(np.float16),
+        "albedo": np.moveaxis(np.asarray(traced.albedos(table)), 1, 2).astype(np.float32),
+    }
+    if isinstance(made.family, SheenFamily):
+        return held
     finer = np.interp(np.arange(FINER * (KNOTS - 1) + 1) / FINER, np.arange(KNOTS), made.knots)
     # A cubemap of fewer texels needs as many samples for the smoothest lobes as 64 x 64 texels for smoother ones.
     coarse = np.arange(SMALLEST, tables.TEXELS, FINER)
@@ -150,12 +165,7 @@ def columns(made: Material, table: LobeBrdf) -> dict[str, np.ndarray]:
         bright_texels.samples_for(made.family(jnp.asarray(max(where, finer[0]))), size=int(edge))
         for where, edge in zip(place, size, strict=True)
     ]
-    return {
-        "zonal": np.stack([_zonal(made.family(jnp.asarray(each))) for each in made.knots]).astype(np.float16),
-        "samples": np.array(samples, np.uint8),
-        "samples.knot": place.astype(np.float32),
-        "albedo": np.moveaxis(np.asarray(traced.albedos(table)), 1, 2).astype(np.float32),
-    }
+    return held | {"samples": np.array(samples, np.uint8), "samples.knot": place.astype(np.float32)}
 
 
 def _zonal(brdf: Channels) -> Float[np.ndarray, "l k"]:
@@ -203,7 +213,7 @@ def _albedo(brdf: Channels) -> np.ndarray:
 def main(options: Sequence[str]) -> None:
     """Writes the files."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    names = tables.METALLIC_ROUGHNESS.name, tables.BLINN_PHONG.name
+    names = tables.METALLIC_ROUGHNESS.name, tables.BLINN_PHONG.name, tables.SHEEN.name
     kinds = "lobes", "harmonics", "columns", "paths"
     parser.add_argument("material", nargs="*", help=", ".join(names))
     parser.add_argument("--lobes", type=int, nargs="*", default=COUNTS)

@@ -1,4 +1,4 @@
-"""Tables of metallic-roughness and Blinn-Phong materials over roughness, fitted once and shipped with the package.
+"""Tables of metallic-roughness and Blinn-Phong materials and of sheens over roughness, fitted once and shipped.
 
 Each material has one file. `jaxprt.systems.standard.fit` writes it. Reading runs on the host: it compiles no program.
 Numbers are stored in half precision, directions in 16-bit fixed point.
@@ -23,7 +23,7 @@ from jaxprt.systems.bounces.varying import Sent
 from jaxprt.systems.harmonic import HarmonicBrdf
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.separable import SeparableBrdf
-from jaxprt.systems.standard.families import RoughnessFamily, ShininessFamily
+from jaxprt.systems.standard.families import RoughnessFamily, SheenFamily, ShininessFamily
 
 LOBES = 12  # default number of lobes
 DEGREE = 4  # of the harmonics
@@ -81,11 +81,13 @@ class StandardTable:
         return tuple(sorted(int(name[5:-5]) for name in names))
 
     @property
-    def family(self) -> RoughnessFamily | ShininessFamily:
+    def family(self) -> RoughnessFamily | ShininessFamily | SheenFamily:
         """Function from the logarithm of a roughness to the BRDF with all channels."""
         scale = constant(self._stored["channel"])
         if self.name == "blinn_phong":
             return ShininessFamily(scale)
+        if self.name == "sheen":
+            return SheenFamily(scale)
         return RoughnessFamily(tuple(range(len(scale))), scale, constant(np.zeros(())))
 
     def lobes(self, count: int = LOBES) -> LobeBrdf:
@@ -178,7 +180,7 @@ class StandardTable:
     @property
     def _power(self) -> int:
         """Power of the roughness to which the width of lobes is proportional."""
-        return 1 if self.name == "blinn_phong" else 2
+        return 2 if self.name == "metallic_roughness" else 1
 
     @property
     def _stored(self) -> Mapping[str, np.ndarray]:
@@ -187,6 +189,7 @@ class StandardTable:
 
 METALLIC_ROUGHNESS = StandardTable("metallic_roughness")
 BLINN_PHONG = StandardTable("blinn_phong")
+SHEEN = StandardTable("sheen")
 
 
 def is_traced(albedo: Float[np.ndarray, "3"]) -> bool:

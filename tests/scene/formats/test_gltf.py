@@ -405,7 +405,7 @@ def test_what_is_not_honored_is_said_once_by_name(tmp_path):
     writer.header["materials"] = [
         {
             **{"alphaMode": "DITHER", "occlusionTexture": image, "emissiveTexture": image},
-            "extensions": {"KHR_materials_sheen": {}, "KHR_materials_ior": {}},
+            "extensions": {"KHR_materials_iridescence": {}, "KHR_materials_ior": {}},
         }
     ]
     parts = [writer.square(material=0, COLOR_1=SQUARE) | {"targets": [{}]}, writer.square(mode=1)]
@@ -414,7 +414,7 @@ def test_what_is_not_honored_is_said_once_by_name(tmp_path):
     with pytest.warns(UserWarning, match="not supported and ignored") as caught:
         load_scene(writer.write(tmp_path / "much.glb"))
     (message,) = [str(each.message) for each in caught]
-    expected = ["COLOR_1", "KHR_animation_pointer", "KHR_materials_sheen", "alpha mode 'DITHER'"]
+    expected = ["COLOR_1", "KHR_animation_pointer", "KHR_materials_iridescence", "alpha mode 'DITHER'"]
     expected += ["occlusion textures", "points and lines"]
     expected += ["textures of primitives without texture coordinates"]
     assert message.startswith(f"{tmp_path / 'much.glb'}: not supported and ignored are ")
@@ -598,6 +598,7 @@ def test_all_textures_are_transformed_and_coats_and_transmission_are_read(tmp_pa
         "KHR_materials_anisotropy": anisotropy,
         "KHR_materials_clearcoat": coat,
         "KHR_materials_transmission": {"transmissionFactor": 0.7, "transmissionTexture": texture},
+        "KHR_materials_sheen": {"sheenColorTexture": texture, "sheenRoughnessTexture": texture},
     }
     pbr = {"baseColorTexture": texture, "metallicRoughnessTexture": texture}
     item = {"pbrMetallicRoughness": pbr, "normalTexture": texture, "emissiveTexture": texture, "extensions": extension}
@@ -605,7 +606,7 @@ def test_all_textures_are_transformed_and_coats_and_transmission_are_read(tmp_pa
     one(writer.square(material=0, TEXCOORD_0=PLACE, TEXCOORD_1=PLACE), writer=writer)
     with pytest.warns(UserWarning, match="ignored are normal maps of clearcoats .*, refraction and blur"):
         material = load_scene(writer.write(tmp_path / "a.glb")).parts[0].material
-    assert len(material.textures) == 11
+    assert len(material.textures) == 13
     for each in material.textures:
         assert each.set == 1
         # With v up, image coordinates are (2 u + 0.25, 1 - (4 (1 - v) + 0.5)).
@@ -616,3 +617,23 @@ def test_all_textures_are_transformed_and_coats_and_transmission_are_read(tmp_pa
     for name, value in (("clearcoat", 0.2), ("clearcoat_roughness", 0.4), ("transmission", 0.2)):
         image = np.asarray(getattr(material, f"{name}_texture").image)
         np.testing.assert_allclose(image, np.full((2, 2, 1), value), atol=2e-3)
+
+
+def test_sheens_are_read_and_left_out_under_clear_coats(tmp_path):
+    writer = Writer()
+    color = np.full((2, 2, 4), 0.5)
+    color[..., 3] = 0.25
+    texture = writer.texture(tmp_path, color)
+    velvet = {"sheenColorFactor": [0.9, 0.5, 0.1], "sheenRoughnessFactor": 0.4}
+    velvet |= {"sheenColorTexture": texture, "sheenRoughnessTexture": texture}
+    both = {"KHR_materials_sheen": velvet, "KHR_materials_clearcoat": {"clearcoatFactor": 1.0}}
+    writer.header["materials"] = [{"extensions": {"KHR_materials_sheen": velvet}}, {"extensions": both}]
+    one(*(writer.square(material=n, TEXCOORD_0=PLACE) for n in (0, 1)), writer=writer)
+    with pytest.warns(UserWarning, match="not supported and ignored are sheens under clearcoats$"):
+        first, second = (part.material for part in load_scene(writer.write(tmp_path / "a.glb")).parts)
+    np.testing.assert_allclose(first.sheen_color, [0.9, 0.5, 0.1], rtol=1e-6)
+    assert float(first.sheen_roughness) == pytest.approx(0.4)
+    linear = ((0.5 + 0.055) / 1.055) ** 2.4
+    np.testing.assert_allclose(first.sheen_color_texture.image, np.full((2, 2, 3), linear), atol=4e-3)
+    np.testing.assert_allclose(first.sheen_roughness_texture.image, np.full((2, 2, 1), 0.25), atol=4e-3)
+    assert not np.any(second.sheen_color)

@@ -1,4 +1,4 @@
-"""Scenes without clear coats, for pages, whose modules know one roughness for each vertex."""
+"""Scenes without clear coats and sheens, for pages, whose modules know one roughness for each vertex."""
 
 import dataclasses
 import warnings
@@ -6,7 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from jaxprt.brdf.coat import ClearCoat
+from jaxprt.brdf import ClearCoat, Sheen
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.groups import Place
@@ -14,24 +14,24 @@ from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Part, TexturedMaterial
 from jaxprt.systems import bright_texels, harmonic, lobe, standard
 from jaxprt.systems.protocol import Blend
-from jaxprt.systems.standard.coated import BASE
+from jaxprt.systems.standard.layered import BASE
 
 
-def without_coats(scene: RelitScene) -> RelitScene:
-    """A relit scene in direct light with the bases of its coated parts, with one warning that names these parts.
+def without_layers(scene: RelitScene) -> RelitScene:
+    """A relit scene in direct light with the bases of its parts under layers, with one warning that names these parts.
 
-    A scene without clear coats is returned as it is.
+    A scene without clear coats and sheens is returned as it is.
     """
-    coated = [shading.table is standard.COATED for shading in scene.shading]
-    if not any(coated):
+    layered = [shading.layered for shading in scene.shading]
+    if not any(layered):
         return scene
     old = scene.scene
-    names = ", ".join(repr(part.name) for part, has in zip(old.parts, coated, strict=True) if has)
-    warnings.warn(f"the page shows these parts without their clear coats: {names}", stacklevel=3)
-    parts = [_bare(part) if has else part for part, has in zip(old.parts, coated, strict=True)]
-    shadings = [_base(each) if has else each for each, has in zip(scene.shading, coated, strict=True)]
+    names = ", ".join(repr(part.name) for part, has in zip(old.parts, layered, strict=True) if has)
+    warnings.warn(f"the page shows these parts without their clear coats and sheens: {names}", stacklevel=3)
+    parts = [_bare(part) if has else part for part, has in zip(old.parts, layered, strict=True)]
+    shadings = [_base(each) if has else each for each, has in zip(scene.shading, layered, strict=True)]
     systems = [scene.part_system(number) for number in range(len(parts))]
-    systems = [_alone(each) if has else each for each, has in zip(systems, coated, strict=True)]
+    systems = [_alone(each) if has else each for each, has in zip(systems, layered, strict=True)]
     counts, alone = [len(part.mesh.position) for part in parts], [[number] for number in range(len(parts))]
     place = Place.of(counts, alone, [False] * len(counts))
     return RelitScene(dataclasses.replace(old, parts=parts), shadings, place, systems)
@@ -40,15 +40,17 @@ def without_coats(scene: RelitScene) -> RelitScene:
 def _bare(part: Part) -> Part:
     """The part with the base of its material."""
     assert isinstance(part.material, TexturedMaterial)
-    return dataclasses.replace(part, material=dataclasses.replace(part.material, clearcoat=0.0, clearcoat_texture=None))
+    none: dict[str, Any] = {"clearcoat": 0.0, "clearcoat_texture": None}
+    none |= {"sheen_color": jnp.zeros(3), "sheen_color_texture": None}
+    return dataclasses.replace(part, material=dataclasses.replace(part.material, **none))
 
 
 def _base(shading: Shading) -> Shading:
-    """The base of a coated part."""
+    """The base of a part under a layer."""
     table, blend, exact = standard.METALLIC_ROUGHNESS, shading.blend, shading.exact
     assert blend is not None
     assert isinstance(exact, PerVertex)
-    assert isinstance(exact.model, ClearCoat)
+    assert isinstance(exact.model, ClearCoat | Sheen)
     weight = jnp.asarray(blend.weight[:, :BASE] + blend.weight[:, BASE : 2 * BASE])
     return dataclasses.replace(
         shading,
@@ -63,7 +65,7 @@ def _base(shading: Shading) -> Shading:
 
 
 def _alone(system: Any) -> Any:
-    """The system of a coated part with the tables of its base."""
+    """The system of a part under a layer with the tables of its base."""
     table = standard.METALLIC_ROUGHNESS
     if isinstance(system, bright_texels.BrightTexels):
         return dataclasses.replace(system, system=_alone(system.system), brdf=table.family)

@@ -1,0 +1,241 @@
+"""Tables of metallic-roughness materials under a clear coat or a sheen, made of the tables of both.
+
+A table has two parameters: the logarithms of the roughness of the base and of the layer. Its channels are the four
+terms of the base, these terms under a full layer, and the layer. Lobes of the base and of the layer stand one after
+another, so no lobe is fitted, and between knots the lobes of one do not change with the roughness of the other.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxprt import require
+from jaxprt.brdf import GGX, Charlie, CoatedModel, MetallicRoughness, UnderSheen, coat_reflectance, sheen_albedo
+from jaxprt.brdf.varying import Channels
+from jaxprt.systems.bounces.varying import Sent
+from jaxprt.systems.harmonic import HarmonicBrdf
+from jaxprt.systems.lobe import LobeBrdf
+from jaxprt.systems.separable import SeparableBrdf
+from jaxprt.systems.standard import tables
+from jaxprt.systems.standard.tables import METALLIC_ROUGHNESS, SHEEN, StandardTable
+
+BASE = 4  # number of terms of the base
+TERM = tuple(range(2 * BASE + 1))  # indices of the channels
+_MIRROR = 1  # index of the term of metallic-roughness whose lobe is that of a coat
+_WHITE = 3  # index of the ideally diffuse term
+_VIEWS = np.sqrt((np.arange(16) + 0.5) / 16)  # cosines of views, uniform in projected solid angle
+
+
+class Layer(NamedTuple):
+    """What lies over a material.
+
+    Attributes:
+        table: The table with the lobe of the layer.
+        channel: Index of its channel there.
+        taken: Share of the light that a full layer takes from what is under it, at cosines of views, for each
+            roughness: a function of the cosines and of the logarithms of the roughness.
+        reflects: Whether the lobe of the table, of albedo 1, is to be multiplied by that share. The lobe of a sheen
+            has its own albedo.
+    """
+
+    table: StandardTable
+    channel: int
+    taken: Callable[[Float[np.ndarray, " v"], Float[np.ndarray, " n"]], Float[np.ndarray, "n v"]]
+    reflects: bool
+
+    def sent(self, cosine: Float[np.ndarray, " v"]) -> Float[np.ndarray, "n v"]:
+        """Factor of the lobe at its knots."""
+        taken = self.taken(cosine, self.table.knot)
+        return taken if self.reflects else np.ones_like(taken)
+
+
+def _of_coat(cosine: np.ndarray, knot: np.ndarray) -> np.ndarray:
+    return np.broadcast_to(coat_reflectance(cosine), (len(knot), len(cosine)))
+
+
+def _of_sheen(cosine: np.ndarray, knot: np.ndarray) -> np.ndarray:
+    return sheen_albedo(cosine, np.exp(knot)[:, None])
+
+
+class LayeredFamily(eqx.Module):
+    """Maps the roughness of the base and of the layer to the BRDF of all channels.
+
+    Attributes:
+        coat: Whether the layer is a clear coat; else it is a sheen.
+        scale: Factor of each channel.
+    """
+
+    coat: bool = eqx.field(static=True)
+    scale: Float[Array, " k"]
+
+    def __call__(self, log_roughness: Float[Array, ""] | float, log_layer: Float[Array, ""] | float) -> Channels:
+        """The BRDF for the natural logarithms of both roughnesses."""
+        base, roughness = MetallicRoughness(roughness=jnp.exp(log_roughness)).terms(), jnp.exp(log_layer)
+        if self.coat:
+            under = tuple(CoatedModel(each, transmits=True) for each in base)
+            return Channels((*base, *under, CoatedModel(GGX(1.0, roughness), transmits=False)), self.scale)
+        return Channels((*base, *(UnderSheen(each, roughness) for each in base), Charlie(roughness)), self.scale)
+
+
+@dataclass(frozen=True)
+class LayeredTable(StandardTable):
+    """The tables of metallic-roughness materials under a layer; see `StandardTable`.
+
+    Where that takes the logarithm of a roughness, this takes those of the base and of the layer.
+
+    Attributes:
+        layer: The layer.
+    """
+
+    layer: Layer
+
+    @property
+    def scale(self) -> Float[np.ndarray, " k"]:
+        """Factor of each channel."""
+        scale = METALLIC_ROUGHNESS.scale
+        return np.concatenate([scale, scale, self.layer.table.scale[[self.layer.channel]]])
+
+    @property
+    def term(self) -> tuple[int, ...]:
+        """Indices of the channels."""
+        return TERM
+
+    @property
+    def knots(self) -> tuple[np.ndarray, ...]:
+        """Logarithms of the roughness of the base, and of that of the layer, at which lobes are tabulated."""
+        return (self.knot, self.layer.table.knot)
+
+    @property
+    def family(self) -> Any:
+        """Function from the logarithms of both roughnesses to the BRDF with all channels."""
+        return LayeredFamily(self.layer.reflects, tables.constant(self.scale))
+
+    def lobes(self, count: int = tables.LOBES) -> LobeBrdf:
+        """The BRDF as lobes: `count` for the base, and as many for the layer."""
+        require.count("count", count, least=1)
+        return _lobes(self.layer, int(count), jnp.result_type(float))
+
+    def harmonics(self, degree: int = tables.DEGREE) -> HarmonicBrdf:
+        """The BRDF in spherical harmonics up to a degree."""
+        return _harmonics(self.layer, degree, jnp.result_type(float))
+
+    def paths(self) -> tuple[SeparableBrdf, Sent]:
+        """The functions with which parts send light to others, and their weights over both roughnesses.
+
+        Others receive the light of a sheen as that of a matte surface of the same albedo.
+        """
+        return _paths(self.layer, jnp.result_type(float))
+
+    def curvature(self, log_roughness: Any, weight: Float[np.ndarray, " k"], degree: int | None = None) -> float:
+        """RMS Laplacian of radiance over the mirror direction: that of base or layer, whichever is larger."""
+        each = zip(
+            (METALLIC_ROUGHNESS, self.layer.table), log_roughness, self._apart(log_roughness[1], weight), strict=True
+        )
+        return max(table.curvature(place, own, degree) for table, place, own in each if np.any(own))
+
+    def samples(self, log_roughness: Any, size: int = tables.TEXELS) -> int:
+        """Samples along the edge of a texel, for the smoother one of base and coat. A sheen needs one."""
+        return METALLIC_ROUGHNESS.samples(min(log_roughness) if self.layer.reflects else log_roughness[0], size)
+
+    def is_sharp(self, log_roughness: Any, weight: Float[np.ndarray, " k"] | None = None) -> bool:
+        """Whether lobes of base and layer together are narrow enough to be traced."""
+        weight = np.ones(len(TERM)) if weight is None else np.asarray(weight, np.float64)
+        each = zip(
+            (METALLIC_ROUGHNESS, self.layer.table), log_roughness, self._apart(log_roughness[1], weight), strict=True
+        )
+        return tables.is_traced(np.sum([table.albedos(place, own) for table, place, own in each], 0))
+
+    def _apart(self, log_layer: float, weight: Float[np.ndarray, " k"]) -> tuple[np.ndarray, np.ndarray]:
+        """Mean weights of the terms of the base, and of the channels of the layer's table."""
+        weight, layer = np.asarray(weight, np.float64), self.layer
+        taken = layer.taken(_VIEWS, np.array([log_layer])).mean()
+        own = np.zeros(len(layer.table.scale))
+        own[layer.channel] = weight[-1] * (taken if layer.reflects else 1)
+        return weight[:BASE] + (1 - taken) * weight[BASE : 2 * BASE], own
+
+    @property
+    def _stored(self) -> Any:
+        return METALLIC_ROUGHNESS._stored
+
+
+COATED = LayeredTable("coated metallic_roughness", Layer(METALLIC_ROUGHNESS, _MIRROR, _of_coat, reflects=True))
+SHEENED = LayeredTable("metallic_roughness under a sheen", Layer(SHEEN, 0, _of_sheen, reflects=False))
+
+
+def _cosine(tangent: np.ndarray) -> np.ndarray:
+    """Cosines of views, given by tan(theta / 2)."""
+    return (1 - tangent**2) / (1 + tangent**2)
+
+
+def _over(base: Any, layer: Any, axis: int) -> np.ndarray:
+    """Entries [... n v] of the base over the second parameter, and of the layer [... m v] over the first."""
+    base, layer = np.asarray(base), np.asarray(layer)
+    shape = (base.shape[-2], layer.shape[-2], base.shape[-1])
+    rows = np.broadcast_to(base[..., :, None, :], (*base.shape[:-2], *shape))
+    return np.concatenate([rows, np.broadcast_to(layer[..., None, :, :], (*layer.shape[:-2], *shape))], axis)
+
+
+def _under(base: Any, layer: Any, taken: np.ndarray) -> np.ndarray:
+    """Channels [k ... n v] of the base, these under a full layer, and that of the layer [1 ... m v]."""
+    whole = _over(base, layer, 0)
+    return np.concatenate([whole[:-1], whole[:-1] * (1 - taken), whole[-1:]])
+
+
+@functools.cache
+def _lobes(layer: Layer, count: int, dtype: Any) -> LobeBrdf:
+    base, own = METALLIC_ROUGHNESS.lobes(count), layer.table.lobes(count)
+    cosine = _cosine(np.linspace(0, 1, base.scale.shape[-1]))
+    taken, sent = layer.taken(cosine, layer.table.knot), layer.sent(cosine)
+    strength, matte = (np.asarray(each)[[layer.channel]] * sent for each in (own.weight, own.diffuse))
+    # Lobes of the base have no weight in the channel of the layer, and its lobes none in those of the base.
+    weight = np.concatenate(
+        [
+            _under(base.weight, 0 * strength, taken),
+            _under(np.zeros((BASE, *own.scale.shape[:1], *base.scale.shape[1:])), strength, taken),
+        ],
+        1,
+    )
+    arrays = (
+        _over(base.mean, own.mean, 1),
+        _over(base.scale, own.scale, 0),
+        weight,
+        _under(base.diffuse, matte, taken),
+    )
+    mean, scale, weight, diffuse = (tables.constant(each, dtype=dtype) for each in arrays)
+    return LobeBrdf(mean, scale, weight, diffuse, (base.knot[0], own.knot[0]), jnp.maximum(base.error, own.error))
+
+
+@functools.cache
+def _harmonics(layer: Layer, degree: int, dtype: Any) -> HarmonicBrdf:
+    base, own = METALLIC_ROUGHNESS.harmonics(degree), layer.table.harmonics(degree)
+    cosine, knot = _cosine(np.arange(base.table.shape[-1]) / base.steps), np.asarray(own.knot[0], np.float64)
+    taken = layer.taken(cosine, knot)
+    lobe = np.asarray(own.table)[:, [layer.channel]] * (taken if layer.reflects else 1)
+    channels = _under(np.moveaxis(np.asarray(base.table), 1, 0), np.moveaxis(lobe, 1, 0), taken)
+    return HarmonicBrdf(
+        tables.constant(np.moveaxis(channels, 0, 1), dtype=dtype),
+        (base.knot[0], own.knot[0]),
+        jnp.maximum(base.error, own.error),
+    )
+
+
+@functools.cache
+def _paths(layer: Layer, dtype: Any) -> tuple[SeparableBrdf, Sent]:
+    brdf, sent = METALLIC_ROUGHNESS.paths()
+    factor, knot = np.asarray(sent.factor), layer.table.knot
+    taken = layer.taken(_VIEWS, knot).mean(1)
+    if layer.reflects:
+        own = factor[:, layer.channel] * taken[:, None]
+    else:
+        own = factor[0, _WHITE] / METALLIC_ROUGHNESS.scale[_WHITE] * taken[:, None]
+    shape = (len(factor), len(knot))
+    base = np.broadcast_to(factor[:, None], (*shape, *factor.shape[1:]))
+    layers = np.broadcast_to(own[:, None], (*shape, 1, factor.shape[2]))
+    whole = np.concatenate([base, base * (1 - taken[:, None, None]), layers], 2)
+    return brdf, Sent((sent.knot[0], tables.constant(knot, dtype=dtype)), tables.constant(whole, dtype=dtype))
