@@ -82,7 +82,7 @@ class Charlie(Model):
 
 @functools.cache
 def _albedos() -> Float[np.ndarray, "r v"]:
-    """Albedo of `Charlie` for roughnesses from `SMOOTHEST` to 1, and for views at even steps of tan(theta / 2)."""
+    """Albedo of `Charlie` at even steps of the logarithm of roughness and of tan(theta / 2) of the view."""
     tangent = np.linspace(0, 1, _ANGLES)
     tangent[-1] = _LOWEST
     cos_o = (1 - tangent**2) / (1 + tangent**2)
@@ -95,10 +95,10 @@ def _albedos() -> Float[np.ndarray, "r v"]:
     along = cos_i * cos_o + np.sqrt((1 - cos_i**2) * (1 - cos_o**2)) * turn
     sine2 = np.maximum(1 - (cos_i + cos_o) ** 2 / np.maximum(2 + 2 * along, _TINY), 0)
     rows = []
-    for roughness in np.linspace(SMOOTHEST, 1, _ROUGHNESSES):
+    for roughness in np.geomspace(SMOOTHEST, 1, _ROUGHNESSES):
         value = _value(sine2, cos_i, cos_o, np.float64(roughness)).mean(-1)
         rows.append(2 * np.pi * value @ (cos_i[:, 0] * area))
-    return np.minimum(np.stack(rows), 1)
+    return np.stack(rows)
 
 
 def sheen_albedo(cosine: Float[Array | np.ndarray, "*b"], roughness: Any) -> Any:
@@ -107,13 +107,13 @@ def sheen_albedo(cosine: Float[Array | np.ndarray, "*b"], roughness: Any) -> Any
     table = xp.asarray(_albedos(), cosine.dtype)
     cosine = xp.clip(cosine, 0, 1)
     across = xp.sqrt((1 - cosine) / (1 + cosine)) * (_ANGLES - 1)
-    down = (xp.clip(roughness, SMOOTHEST, 1) - SMOOTHEST) / (1 - SMOOTHEST) * (_ROUGHNESSES - 1)
+    down = (1 - xp.log(xp.clip(roughness, SMOOTHEST, 1)) / np.log(SMOOTHEST)) * (_ROUGHNESSES - 1)
     across, down = xp.broadcast_arrays(across, down)
     column = xp.clip(across.astype(int), 0, _ANGLES - 2)
     row = xp.clip(down.astype(int), 0, _ROUGHNESSES - 2)
     right, below = across - column, down - row
     upper, lower = (table[row + step, column] * (1 - right) + table[row + step, column + 1] * right for step in (0, 1))
-    return upper * (1 - below) + lower * below
+    return xp.minimum(upper * (1 - below) + lower * below, 1)
 
 
 class UnderSheen(eqx.Module):
