@@ -106,7 +106,7 @@ def sheen_albedo(cosine: Float[Array | np.ndarray, "*b"], roughness: Any) -> Any
     xp: Any = np if isinstance(cosine, np.ndarray) else jnp
     table = xp.asarray(_albedos(), cosine.dtype)
     cosine = xp.clip(cosine, 0, 1)
-    across = xp.sqrt((1 - cosine) / (1 + cosine)) * (_ANGLES - 1)
+    across = xp.sqrt(xp.maximum((1 - cosine) / (1 + cosine), _TINY)) * (_ANGLES - 1)
     down = (1 - xp.log(xp.clip(roughness, SMOOTHEST, 1)) / np.log(SMOOTHEST)) * (_ROUGHNESSES - 1)
     across, down = xp.broadcast_arrays(across, down)
     column = xp.clip(across.astype(int), 0, _ANGLES - 2)

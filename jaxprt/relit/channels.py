@@ -316,7 +316,7 @@ def replaced(part: Part, shading: Shading, material: TexturedMaterial | BlinnPho
         (standard.SHEENED, "sheen_color", "sheen"),
     ):
         value = getattr(material, name, 0.0)
-        if shading.table is not table and not isinstance(value, Tracer) and np.any(value):
+        if shading.table is not table and not isinstance(value, Tracer) and np.any(np.asarray(value)):
             raise ValueError(
                 f"part {part.name!r} was precomputed without a {layer}, got a material with {name}={value}: "
                 f"precompute it with a {layer}, of a {name} of 1e-6 at least"

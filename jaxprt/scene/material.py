@@ -24,9 +24,14 @@ def _scalar(value: Any) -> Any:
 
 
 def _color(value: Any) -> Any:
-    """A number or a color as an array of shape [3]."""
+    """A number or a color as an array of shape [3]. What is known stays known while JAX traces."""
     value = _scalar(value)
-    return jnp.broadcast_to(value, (3,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
+    if not isinstance(value, jax.Array) or value.ndim:
+        return value
+    if isinstance(value, Tracer):
+        return jnp.broadcast_to(value, (3,))
+    with jax.ensure_compile_time_eval():
+        return jnp.broadcast_to(value, (3,))
 
 
 class Texture(eqx.Module):

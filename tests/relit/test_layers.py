@@ -254,6 +254,12 @@ def test_relit_scenes_with_sheens_are_the_exact_sum():
 
     slope = float(jax.grad(power)(jnp.float32(0.5)))
     np.testing.assert_allclose(slope, (power(jnp.float32(0.6)) - power(jnp.float32(0.4))) / 0.2, rtol=0.01)
+    slope = float(jax.jit(jax.grad(lambda size: jnp.sum(relit.radiance(light, eye=size * eye))))(jnp.float32(1.0)))
+    assert np.isfinite(slope)
+    replaced = jax.jit(
+        lambda r: relit.radiance(light, eye=eye, materials={"ball 0": dataclasses.replace(VELVET, roughness=r)})
+    )
+    np.testing.assert_allclose(replaced(jnp.float32(0.8)), ours, rtol=1e-4, atol=1e-5)
     with pytest.raises(ValueError, match=r"precomputed without a clear coat, got a material with clearcoat=0\.8"):
         relit.radiance(light, eye=eye, materials={"ball 0": COATED})
     with pytest.raises(ValueError, match="part 'ball 0' was precomputed without a sheen"):
@@ -288,3 +294,15 @@ def test_materials_without_standard_tables_lose_their_coat_with_a_warning():
     assert shading.table is None
     bare = channels.of_part(spheres(dataclasses.replace(brushed, clearcoat=0.0)).parts[0])
     np.testing.assert_allclose(shading.blend.weight, bare.blend.weight, rtol=1e-4)
+
+
+def test_materials_made_while_jax_traces_have_no_layers():
+    parts = spheres(TexturedMaterial(0.5, 0.0, 0.4)).parts
+
+    @jax.jit
+    def columns(color):
+        table = material_table.of_parts([dataclasses.replace(parts[0], material=TexturedMaterial(color, 0.0, 0.4))])
+        assert not table.layered
+        return table.at_vertices().coefficient
+
+    assert columns(jnp.float32(0.5)).shape[1] == 4
