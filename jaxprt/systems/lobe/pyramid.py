@@ -34,6 +34,7 @@ _BITS = 2  # largest number of scales that are read from the bits
 _FINE = 16
 _TAPS = 3  # texels along an axis from which visibility is interpolated
 _BYTE = 255
+_COLUMNS = 128  # vertices or points of a block, whose pyramids are read together
 _R2 = 0.7548776662466927, 0.5698402909980532  # steps of a sequence that fills squares evenly
 _BLOCK = 1024
 
@@ -93,23 +94,41 @@ class LobeTransport(eqx.Module):
             Mean visibility of each lobe, from 0 to 1, and its derivatives with respect to s and t.
         """
         # Split into separate programs: XLA vectorizes CPU code only without gathers, and recomputes a value for each
-        # use.
-        address, bit = _addresses(face, s, t, spread, size=self.size)
-        rows = _by_vertex(address)
-        if points is None:
-            read, weight = (_by_tap(_bytes(self.pyramid, rows)),), None
-        else:
-            read = tuple(_by_tap(_bytes_of(self.pyramid, corner, rows)) for corner in points.corner)
-            weight = points.weight.astype(spread.dtype)
-        return _decoded(read, weight, bit, s, t, spread, size=self.size)
+        # use. In blocks, what a few neighboring vertices read stays in the cache, and no array is transposed.
+        count = face.shape[1]
+        face, s, t, spread = (_blocks(each) for each in (face, s, t, spread))
+        down, right, bit = _addresses(face, s, t, spread, size=self.size)
+        corners = (np.arange(count, dtype=np.int32),) if points is None else points.corner
+        read = tuple(_bytes(self.pyramid, _blocks(corner[None]), down, right) for corner in corners)
+        weight = None if points is None else _blocks(points.weight.astype(spread.dtype))
+        seen, by_s, by_t = _decoded(read, weight, bit, s, t, spread, size=self.size)
+        return _columns(seen, count), _columns(by_s, count), _columns(by_t, count)
+
+
+def _blocks(value: Array | np.ndarray) -> Array:
+    """Columns in blocks: [l v] as [b l m], with zeros after the last one."""
+    rows, count = value.shape
+    block = max(min(_COLUMNS, count), 1)
+    blocks = -(-count // block)
+    wide = jnp.pad(value, ((0, 0), (0, blocks * block - count)))
+    return jnp.swapaxes(wide.reshape(rows, blocks, block), 0, 1)
+
+
+def _columns(value: Array, count: int) -> Array:
+    """The inverse of `_blocks`."""
+    return jnp.swapaxes(value, 0, 1).reshape(value.shape[1], -1)[:, :count]
 
 
 @partial(isolated, static=("size",))
-def _addresses(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> tuple[tuple, tuple]:
+def _addresses(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> tuple[Array, Array, tuple]:
     """Addresses of the bytes that each lobe reads: 3 x 3 texels at two scales, by rows.
 
-    For scales stored as bits, the bit is the sum of one number for each of the three rows and one for each of the three
-    columns, which follow for each scale.
+    An address is the sum of one number for each of the three rows and one for each of the three columns. So is the bit,
+    for scales stored as bits.
+
+    Returns:
+        Numbers of the rows and of the columns [b 2 3 l m] for both scales; and those of the bits, first of all rows and
+        then of all columns of each scale.
     """
     scale = scales(size)
     number, _ = between(scale, spread)
@@ -128,32 +147,19 @@ def _addresses(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> 
             for x, y in zip(first, row, strict=True)
         ]
         right = [jnp.where(in_bits, x >> 2, y) for x, y in zip(second, column, strict=True)]
-        address += [x + y for x in down for y in right]
+        address.append((jnp.stack(down, 1), jnp.stack(right, 1)))
         bit += [(x & 1) << 1 for x in first] + [((x & 2) << 1) + (x & 1) for x in second]
-    return tuple(address), tuple(bit)
+    down, right = (jnp.stack(each, 1) for each in zip(*address, strict=True))
+    return down, right, tuple(bit)
 
 
 @isolated
-def _by_vertex(address: tuple[Array, ...]) -> Int[Array, "v tl"]:
-    """Groups addresses by vertex, so that each vertex reads from memory that is close together."""
-    return jnp.stack(address).reshape(-1, address[0].shape[1]).T
-
-
-@isolated
-def _bytes(pyramid: UInt8[Array, "v n"], address: Int[Array, "v tl"]) -> UInt8[Array, "v tl"]:
-    return jnp.take_along_axis(pyramid, address, 1, mode="promise_in_bounds")
-
-
-@isolated
-def _bytes_of(
-    pyramid: UInt8[Array, "v n"], corner: Int[Array, " p"], address: Int[Array, "p tl"]
-) -> UInt8[Array, "p tl"]:
-    return pyramid.at[corner[:, None], address].get(mode="promise_in_bounds")
-
-
-@isolated
-def _by_tap(read: UInt8[Array, "v tl"]) -> tuple[Array, ...]:
-    return tuple(read.T.reshape(2 * _TAPS**2, -1, len(read)))
+def _bytes(
+    pyramid: UInt8[Array, "v n"], vertex: Int[Array, "b 1 m"], down: Array, right: Array
+) -> UInt8[Array, "b 2 3 3 l m"]:
+    address = down[:, :, :, None] + right[:, :, None]
+    vertex = jnp.broadcast_to(vertex[:, None, None, None], address.shape)
+    return pyramid.at[vertex, address].get(mode="promise_in_bounds")
 
 
 @partial(isolated, static=("size",))
@@ -165,20 +171,19 @@ def _decoded(
     number, upper = between(scale, spread)
     result = [jnp.zeros_like(spread)] * 3
     for step, part in ((0, 1 - upper), (1, upper)):
-        own, first = [corner[step * _TAPS**2 :][: _TAPS**2] for corner in read], bit[2 * step * _TAPS :]
-        edge = jnp.asarray(scale.edge)[number + step]
+        first, edge = bit[2 * step * _TAPS :], jnp.asarray(scale.edge)[number + step]
 
-        def seen(i, j, own=own, bit=first, number=number + step):
+        def seen(i, j, step=step, bit=first, number=number + step):
             place = bit[i] + bit[_TAPS + j]
-            value = [
-                _seen(corner[_TAPS * i + j], place, number, bits=scale.bits).astype(spread.dtype) for corner in own
-            ]
+            value = [_level(corner[:, step, i, j], place, number, bits=scale.bits) for corner in read]
             if corner_weight is None:
-                return value[0]
-            return reduce(jnp.add, (x * w for x, w in zip(value, corner_weight, strict=True)))
+                return value[0].astype(spread.dtype)
+            weights = jnp.moveaxis(corner_weight[:, :, None], 1, 0)
+            return reduce(jnp.add, (x * w for x, w in zip(value, weights, strict=True)))
 
         sums = _smooth(seen, edge, s, t, rim=number + step >= scale.bits)
-        result = [total + value * part for total, value in zip(result, sums, strict=True)]
+        unit = part / _levels(number + step, bits=scale.bits).astype(spread.dtype)
+        result = [total + value * unit for total, value in zip(result, sums, strict=True)]
     return result[0], result[1], result[2]
 
 
@@ -227,19 +232,23 @@ def _nearest(edge: Array, x: Array) -> Int[Array, "..."]:
     return jnp.clip(place.astype(jnp.int32), 0, edge - 1) + 1
 
 
-def _seen(byte: UInt8[Array, "l v"], bit: Array, number: Array, *, bits: int) -> Array:
-    """Visibility that a byte encodes: one bit at scale 0, the mean of four bits at scale 1, a mean as byte beyond.
+def _level(byte: UInt8[Array, "..."], bit: Array, number: Array, *, bits: int) -> Int[Array, "..."]:
+    """Visibility that a byte encodes, in units of `_levels`.
 
-    `bits` is the number of scales that are read from bits.
+    It is one bit at scale 0, the sum of four bits at scale 1, and a mean as byte beyond. `bits` is the number of scales
+    that are read from bits.
     """
     value = byte.astype(jnp.int32)
     if not bits:
-        return value.astype(jnp.float32) / _BYTE
+        return value
     four = value >> bit & jnp.where(number == 0, 1, 15)
     pair = (four & 5) + (four >> 1 & 5)
-    four = (pair & 3) + (pair >> 2)
-    factor = jnp.where(number == 0, 1.0, jnp.where(number < bits, 1 / 4, 1 / _BYTE)).astype(jnp.float32)
-    return jnp.where(number < bits, four, value) * factor
+    return jnp.where(number < bits, (pair & 3) + (pair >> 2), value)
+
+
+def _levels(number: Array, *, bits: int) -> Int[Array, "..."]:
+    """The unit in which a scale holds visibility: its value where all is visible."""
+    return jnp.where(number >= bits, _BYTE, jnp.where(number == 0, 1, 4))
 
 
 class Scales(NamedTuple):
