@@ -142,7 +142,7 @@ class Sheen(eqx.Module):
 
     Raises:
         TypeError: The base is no `MetallicRoughness`.
-        ValueError: The color is not from 0 to 1, or the roughness is negative or not finite.
+        ValueError: The color or the roughness is not from 0 to 1.
     """
 
     base: MetallicRoughness
@@ -152,7 +152,7 @@ class Sheen(eqx.Module):
     def __check_init__(self):
         require.kind("the base of Sheen", self.base, MetallicRoughness, source="jaxprt.brdf.MetallicRoughness")
         require.within("sheen_color of Sheen", self.sheen_color, 0, 1)
-        require.at_least("sheen_roughness of Sheen", self.sheen_roughness, 0.0)
+        require.within("sheen_roughness of Sheen", self.sheen_roughness, 0, 1)
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the BRDF in 1/sr."""

@@ -1,5 +1,6 @@
 """Precomputes scenes for relighting."""
 
+import dataclasses
 import os
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -117,6 +118,8 @@ def precompute(
     recipes = [_recipe(system, part.name, scene) for part in scene.parts]
     near = centered(scene)
     shadings = shaded(near.parts, recipes)
+    kept = [channels.as_shaded(part, shading) for part, shading in zip(scene.parts, shadings, strict=True)]
+    scene = dataclasses.replace(scene, parts=kept)
     mesh, whole = near.mesh, scene.mesh
     warn.of_gain(near, shadings)
     warn.of_shells(near)

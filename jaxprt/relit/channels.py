@@ -104,8 +104,12 @@ def blend(look: Look, term: tuple[int, ...], scale: Float[Array | np.ndarray, " 
         scale: Factor of each channel.
         varies: Whether the system takes the roughness of each point.
     """
-    weight = look.coefficient[:, np.asarray(term)] / scale[:, None]
-    if term == standard.layered.TERM:
+    weight, columns = look.coefficient[:, np.asarray(term)] / scale[:, None], look.coefficient.shape[1]
+    if rest := [column for column in range(len(_NAMES), columns) if column not in term]:
+        # A layer that was not precomputed: `replaced` refuses it where it is known.
+        xp = np if known(look) else jnp
+        weight = xp.where(xp.any(look.coefficient[:, np.asarray(rest)] != 0, (1, 2))[:, None, None], xp.nan, weight)
+    if len(term) > len(_NAMES):
         return Blend(weight, (look.log_roughness, look.log_layer))
     return Blend(weight, (look.log_roughness,) if varies else ())
 
@@ -142,10 +146,10 @@ def of_part(part: Part, *, look: Look | None = None, takes: Callable[[StandardTa
     look = _look(part) if look is None else look
     mesh, anisotropy = _framed(part)
     emitted = look.emitted if np.any(look.emitted) else None
-    if look.coefficient.shape[1] > len(_NAMES) and np.any(look.coefficient[:, -1]):
+    if np.any(look.coefficient[:, len(_NAMES) :]):
         table = _table_of_layer(part)
         if anisotropy <= _EQUAL and takes(table):
-            exact = PerVertex(_layered(look, table))
+            exact = PerVertex(_layered(part.name, look, table))
             own = blend(look, table.term, table.scale, varies=True)
             return Shading(mesh, table.family, exact, table.knots, own, emitted, table.term, table.scale, table)
         look = _without_layer(part.name, look, table)
@@ -247,32 +251,54 @@ def _table_of_layer(part: Part) -> LayeredTable:
     return standard.COATED
 
 
-def _layered(look: Look, table: LayeredTable) -> ClearCoat | Sheen:
+def _layered(name: str, look: Look, table: LayeredTable) -> ClearCoat | Sheen:
     """The BRDF of each vertex or point of a part with a clear coat or a sheen."""
     assert look.log_layer is not None
-    layer, roughness = look.coefficient[:, -1], jnp.exp(look.log_layer)
-    if table is standard.COATED:
-        return ClearCoat(_metallic(look, 0.0), layer[:, 0], roughness)
-    return Sheen(_metallic(look, 0.0), layer, roughness)
+    layer, roughness = look.coefficient[:, table.term[-1]], jnp.exp(look.log_layer)
+    try:
+        if table == standard.COATED:
+            return ClearCoat(_metallic(look, 0.0), layer[:, 0], roughness)
+        return Sheen(_metallic(look, 0.0), layer, roughness)
+    except ValueError as error:  # the factors are right, so it is a texture
+        raise ValueError(f"part {name!r}, factor times texture: {error}") from error
 
 
-def _model(look: Look, shading: Shading) -> Any:
+def _model(name: str, look: Look, shading: Shading) -> Any:
     """The BRDF of each vertex or point of a part."""
     if isinstance(shading.table, standard.LayeredTable):
-        return _layered(look, shading.table)
+        return _layered(name, look, shading.table)
     return _metallic(look, _anisotropy(shading))
 
 
 def _without_layer(name: str, look: Look, table: LayeredTable) -> Look:
     """The materials without their clear coats or sheens, with a warning."""
-    layer = "clear coat" if table is standard.COATED else "sheen"
     warnings.warn(
-        f"the {layer} of part {name!r} is left out: anisotropic materials, and systems without the standard tables, "
-        "have none",
+        f"the {table.over} of part {name!r} is left out: anisotropic materials, and systems without the standard "
+        "tables, have none",
         stacklevel=3,
     )
-    base = look.coefficient[:, : len(_NAMES)] + look.coefficient[:, len(_NAMES) : 2 * len(_NAMES)]
+    under = np.asarray(table.term)[len(_NAMES) : -1]
+    base = look.coefficient[:, : len(_NAMES)] + look.coefficient[:, under]
     return look._replace(coefficient=np.concatenate([base, 0 * look.coefficient[:, len(_NAMES) :]], 1))
+
+
+def as_shaded(part: Part, shading: Shading) -> Part:
+    """The part with the material that its system shows: without a clear coat or a sheen that was left out."""
+    material = part.material
+    if not isinstance(material, TexturedMaterial):
+        return part
+    coat, fibers = (material_table.may_be(each) for each in (material.clearcoat, material.sheen_color))
+    if not shading.layered and (coat or fibers):
+        material = without_layers(material)
+    elif shading.table == standard.COATED and fibers:
+        material = dataclasses.replace(material, sheen_color=0.0)
+    return part if material is part.material else dataclasses.replace(part, material=material)
+
+
+def without_layers(material: TexturedMaterial) -> TexturedMaterial:
+    """The material without clear coat and sheen."""
+    none: dict[str, Any] = {"clearcoat": 0.0, "clearcoat_texture": None}
+    return dataclasses.replace(material, **none, sheen_color=0.0, sheen_color_texture=None)
 
 
 def appearance(
@@ -311,15 +337,12 @@ def appearance(
 def replaced(part: Part, shading: Shading, material: TexturedMaterial | BlinnPhong) -> Part:
     """The part with a new material. Refuses materials that its system cannot have; `appearance` gives the errors."""
     shiny = shading.table is standard.BLINN_PHONG
-    for table, name, layer in (
-        (standard.COATED, "clearcoat", "clear coat"),
-        (standard.SHEENED, "sheen_color", "sheen"),
-    ):
+    for table, name in ((standard.COATED, "clearcoat"), (standard.SHEENED, "sheen_color")):
         value = getattr(material, name, 0.0)
-        if shading.table is not table and not isinstance(value, Tracer) and np.any(np.asarray(value)):
+        if shading.table != table and not isinstance(value, Tracer) and np.any(np.asarray(value)):
             raise ValueError(
-                f"part {part.name!r} was precomputed without a {layer}, got a material with {name}={value}: "
-                f"precompute it with a {layer}, of a {name} of 1e-6 at least"
+                f"part {part.name!r} was precomputed without a {table.over}, got a material with {name}={value}: "
+                f"precompute it with a {table.over}, of a {name} of 1e-6 at least"
             )
     if isinstance(material, BlinnPhong) != shiny:
         kind = "BlinnPhong" if shiny else "TexturedMaterial"
@@ -335,7 +358,25 @@ def replaced(part: Part, shading: Shading, material: TexturedMaterial | BlinnPho
     new = dataclasses.replace(part, material=material)
     if known(material, shading):
         _check_frames(part, shading, new)
+        _check_opacity(part, material)
     return new
+
+
+def _check_opacity(part: Part, material: TexturedMaterial) -> None:
+    """Refuses another transmission than the precomputed one, and holes or opacity where there were none."""
+    before = part.material
+    assert isinstance(before, TexturedMaterial)
+    old, new = float(before.transmission), float(material.transmission)
+    if abs(old - new) > _EQUAL:
+        raise ValueError(
+            f"part {part.name!r} was precomputed with a transmission of {old:g}, got a material of {new:g}: precompute "
+            "the scene with it, because light passes through"
+        )
+    if material.alpha_mode not in (before.alpha_mode, "opaque"):
+        raise ValueError(
+            f"part {part.name!r} was precomputed with the alpha mode {before.alpha_mode!r}, got a material of "
+            f"{material.alpha_mode!r}: precompute the scene with it, because light passes through"
+        )
 
 
 def at_points(part: Part, shading: Shading, material: Any, points: Points) -> Appearance:
@@ -375,7 +416,7 @@ def materials_at(parts: Sequence[Part], shading: Shading, points: Points) -> tup
         values = look.values
         exponent = 2 / values.roughness**2 - 2
         return own, PerVertex(BlinnPhong(values.base_color, values.specular_color, exponent))
-    return own, PerVertex(_model(look, shading))
+    return own, PerVertex(_model(parts[0].name, look, shading))
 
 
 def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Array | np.ndarray | None, Points]:
@@ -387,7 +428,7 @@ def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Ar
     if not isinstance(part.material, TexturedMaterial):
         return shading.exact, None, points
     look = material_table.of_parts([part]).at(points)
-    return PerVertex(_model(look, shading)), look.emitted, points.tilted(look.normal)
+    return PerVertex(_model(part.name, look, shading)), look.emitted, points.tilted(look.normal)
 
 
 def _fits(name: str, shading: Shading, look: Look) -> Any:

@@ -61,7 +61,7 @@ def factored(shading: Shading) -> Path:
 
 @functools.cache
 def _standard(table: StandardTable) -> Path:
-    if table is not standard.BLINN_PHONG:
+    if table != standard.BLINN_PHONG:
         return Path(*table.paths())
     return _factored(table.family, table.family, table.knots)
 

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxprt import require
 from jaxprt.brdf import BlinnPhong, grid
 from jaxprt.compile import Between, compile_time, known, promoted, put
-from jaxprt.image import automatic_exposure, layers
+from jaxprt.image import automatic_exposure, layers, raster
 from jaxprt.relit import channels, groups, interpolation, measuring, pictures, reflection, tracing
 from jaxprt.relit import lamps as scene_lamps
 from jaxprt.relit.casting import caster
@@ -548,7 +548,8 @@ class RelitScene(System):
         """Exposure of a picture in stops that brings the brightest surfaces near white, whatever is behind them.
 
         `jaxprt.image.display(picture, stops=relit.exposure(picture))` shows the picture. It is
-        `jaxprt.image.automatic_exposure` with the scene's `coverage`.
+        `jaxprt.image.automatic_exposure` with the scene's `coverage`. Pixels whose middle shows a surface that
+        emits do not count, unless there are no others.
 
         Args:
             picture: What `picture` has returned for the camera.
@@ -567,7 +568,21 @@ class RelitScene(System):
                 f"{picture.shape[0]} x {picture.shape[1]}"
             )
         picture = jnp.broadcast_to(picture, (*picture.shape[:2], 3))
-        return automatic_exposure(picture, coverage=self.coverage(camera))
+        coverage = self.coverage(camera)
+        if self.lamps is not None and self.lamps.emitting:
+            rest = coverage * ~self._glowing(camera)
+            coverage = jnp.where(jnp.any(rest > 0), rest, coverage)
+        return automatic_exposure(picture, coverage=coverage)
+
+    def _glowing(self, camera: Camera) -> Bool[np.ndarray, "h w"]:
+        """Whether the middle of each pixel shows a surface that emits."""
+        columns = zip(self.shading, self.place.counts, strict=True)
+        emits = [
+            np.zeros(count) if each.emitted is None else np.asarray(each.emitted).max(1) for each, count in columns
+        ]
+        glowing = np.max(np.concatenate(emits)[np.asarray(self.mesh.face)], 1) > 0
+        seen = np.asarray(raster.rasterize(self.mesh, camera).triangle)
+        return (seen >= 0) & glowing[np.maximum(seen, 0)]
 
     def _picture_view(self, camera: Camera | None, materials, **options: Any) -> PictureView:
         camera = self.camera if camera is None else camera

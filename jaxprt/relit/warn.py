@@ -47,11 +47,11 @@ def of_backs(scene: Scene, mesh: Mesh, camera: Camera) -> None:
     shells = enclosing(scene)
     for number, part in enumerate(scene.parts):
         seen = away[own == number]
-        if _emits(part) or len(seen) <= _SMALLEST * len(way) or np.mean(seen) <= 0.5:
+        if _emits(part) or _lit_behind(part) or len(seen) <= _SMALLEST * len(way) or np.mean(seen) <= 0.5:
             continue
         if number in shells and not _has_lamps(scene):
             continue  # `of_shells` says more
-        remedy = "if its mesh is inside out, with clockwise faces, reverse the corners of each face"
+        remedy = "if its mesh is inside out, negate its normals; without normals, reverse the corners of each face"
         if number in shells:
             remedy = "it encloses the scene, so give a camera inside of it"
         warnings.warn(
@@ -105,6 +105,10 @@ def _backs(part: Part) -> str:
     """What cameras see of the backs of a part."""
     hidden = isinstance(part.material, TexturedMaterial) and part.material.back != "black"
     return "its material hides backs" if hidden else "backs are black"
+
+
+def _lit_behind(part: Part) -> bool:
+    return isinstance(part.material, TexturedMaterial) and part.material.back == "lit"
 
 
 def _emits(part: Part) -> bool:

@@ -209,7 +209,7 @@ class TexturedMaterial(eqx.Module):
         for name in ("rotation", "normal_scale"):
             require.finite(f"{name} of TexturedMaterial", getattr(self, name))
         for name, value in vars(self).items():
-            if isinstance(value, str):
+            if name in ("alpha_mode", "back"):
                 continue
             if not name.endswith("_texture"):
                 shape = (3,) if name in _COLORS else ()
@@ -222,6 +222,7 @@ class TexturedMaterial(eqx.Module):
                 )
             elif value is not None:
                 require.kind(f"{name} of TexturedMaterial", value, Texture, source="jaxprt.scene.Texture")
+                _check_channels(name, value)
         if not isinstance(self.ior, Tracer) and 0 < np.asarray(self.ior) < 1:
             raise ValueError(f"ior of TexturedMaterial must be 0 or at least 1, got {self.ior}")
 
@@ -301,6 +302,15 @@ class TexturedMaterial(eqx.Module):
         # The last axis comes first, because `_unit` replaces zero by the first axis, here the normal.
         scaled = jnp.stack([slope[..., 2], slope[..., 0] * self.normal_scale, slope[..., 1] * self.normal_scale], -1)
         return jnp.roll(_unit(scaled), -1, -1)
+
+
+def _check_channels(name: str, each: Texture) -> None:
+    """Refuses a texture of another number of channels than it is read for. Colors may be gray."""
+    factor, channels = name.removesuffix("_texture"), jnp.shape(each.image)[-1]
+    allowed = (1, 3) if factor in _COLORS else (3,) if factor in ("normal", "anisotropy") else (1,)
+    if channels not in allowed:
+        required = " or ".join(map(str, allowed))
+        raise ValueError(f"{name} of TexturedMaterial must have an image of {required} channels, got {channels}")
 
 
 def _unit(vector: Float[Array, "*b n"]) -> Float[Array, "*b n"]:

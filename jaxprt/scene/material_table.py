@@ -101,9 +101,9 @@ class Look(NamedTuple):
 
     Attributes:
         coefficient: Weights of the four terms of `jaxprt.brdf.MetallicRoughness`. Those of `BlinnPhong` are its colors:
-            diffuse, specular, 0 and 0. In scenes with layers these are followed by the weights under a clear coat or
-            a sheen and by that of the layer, as `jaxprt.systems.standard.layered` has them; without a layer the first
-            four are those of the material.
+            diffuse, specular, 0 and 0. In scenes with layers these are followed by the weights under a clear coat and
+            by that of the coat, and by those under a sheen and that of the sheen; without a layer the first four are
+            those of the material. See `jaxprt.systems.standard.layered`.
         log_roughness: Logarithm of the roughness; that of metallic-roughness materials is at least `SMOOTHEST`.
         emitted: Radiance that the surface emits.
         values: The parameters themselves.
@@ -231,8 +231,10 @@ def _layered(look: Look, layers: Layers, coated: Bool[Array, " p"]) -> Look:
     coat, passing = layers.clearcoat, 1 - layers.transmission
     base = look.coefficient * jnp.stack([passing, jnp.ones_like(coat), jnp.ones_like(coat), passing], 1)[..., None]
     color = jnp.where(coated[:, None], 0, layers.sheen_color)
-    weight = (coat + jnp.max(color, 1))[:, None, None]
-    coefficient = jnp.concatenate([(1 - weight) * base, weight * base, (coat[:, None] + color)[:, None]], 1)
+    weight, most = coat[:, None, None], jnp.max(color, 1)[:, None, None]
+    over_base = jnp.broadcast_to(weight, (len(coat), 1, 3)), color[:, None]
+    rows = (1 - weight - most) * base, weight * base, over_base[0], most * base, over_base[1]
+    coefficient = jnp.concatenate(rows, 1)
     roughness = jnp.where(
         jnp.any(color > 0, 1),
         jnp.maximum(layers.sheen_roughness, sheen.SMOOTHEST),

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from jaxprt.brdf import ClearCoat, Sheen
 from jaxprt.brdf.varying import PerVertex
+from jaxprt.relit import channels
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.groups import Place
 from jaxprt.relit.scene import RelitScene
@@ -40,9 +41,7 @@ def without_layers(scene: RelitScene) -> RelitScene:
 def _bare(part: Part) -> Part:
     """The part with the base of its material."""
     assert isinstance(part.material, TexturedMaterial)
-    none: dict[str, Any] = {"clearcoat": 0.0, "clearcoat_texture": None}
-    none |= {"sheen_color": jnp.zeros(3), "sheen_color_texture": None}
-    return dataclasses.replace(part, material=dataclasses.replace(part.material, **none))
+    return dataclasses.replace(part, material=channels.without_layers(part.material))
 
 
 def _base(shading: Shading) -> Shading:

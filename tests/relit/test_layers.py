@@ -18,6 +18,7 @@ from jaxprt.systems.protocol import Blend
 from jaxprt.view.bases import without_layers
 
 TABLE = 0.03  # error of 12 and 12 lobes, of light of medium width
+EYE = np.array([0.0, 0.0, 5.0])
 COATED = TexturedMaterial([0.6, 0.1, 0.1], 0.0, 0.5, clearcoat=0.8, clearcoat_roughness=0.2)
 VELVET = TexturedMaterial([0.3, 0.03, 0.08], 0.0, 0.8, sheen_color=[0.9, 0.6, 0.7], sheen_roughness=0.5)
 
@@ -176,12 +177,12 @@ def test_textures_of_sheens_multiply_their_factors():
     count, color = len(parts[0].mesh.position), image[0, 0] * np.asarray(VELVET.sheen_color)
     look = material_table.of_parts(parts).at_vertices()
     bare = material_table.of_parts(spheres(dataclasses.replace(VELVET, sheen_color=jnp.zeros(3))).parts).at_vertices()
-    np.testing.assert_allclose(look.coefficient[:count, -1], np.broadcast_to(color, (count, 3)), rtol=1e-5)
+    np.testing.assert_allclose(look.coefficient[:count, 13], np.broadcast_to(color, (count, 3)), rtol=1e-5)
     np.testing.assert_allclose(
-        look.coefficient[:count, 4:8], color.max() * bare.coefficient[:count], rtol=1e-4, atol=1e-7
+        look.coefficient[:count, 9:13], color.max() * bare.coefficient[:count], rtol=1e-4, atol=1e-7
     )
     np.testing.assert_allclose(np.exp(look.log_layer[:count]), max(0.5 * image[0, 0, 0], 0.1), rtol=1e-5)
-    np.testing.assert_allclose(look.coefficient[count : 2 * count, -1], 0.8, rtol=1e-5)
+    np.testing.assert_allclose(look.coefficient[count : 2 * count, 8], 0.8, rtol=1e-5)
     np.testing.assert_allclose(np.exp(look.log_layer[count : 2 * count]), 0.2, rtol=1e-5)
     assert not look.coefficient[2 * count :][:count, 4:].any()
 
@@ -196,7 +197,7 @@ def test_textures_of_layers_multiply_their_factors():
     parts = spheres(textured, plain).parts
     value, count = float(image[0, 0, 0]), len(parts[0].mesh.position)
     look = material_table.of_parts(parts).at_vertices()
-    np.testing.assert_allclose(look.coefficient[:count, -1], 0.5 * value, rtol=1e-5)
+    np.testing.assert_allclose(look.coefficient[:count, 8], 0.5 * value, rtol=1e-5)
     np.testing.assert_allclose(np.exp(look.log_layer[:count]), 0.8 * value, rtol=1e-5)
     bare = look.coefficient[count : 2 * count, :4]
     passing = np.array([1 - 0.6 * value, 1, 1, 1 - 0.6 * value])[:, None]
@@ -266,6 +267,49 @@ def test_relit_scenes_with_sheens_are_the_exact_sum():
         alone.radiance(light, eye=eye, materials={"ball 0": VELVET})
 
 
+def test_layers_that_were_not_precomputed_are_nan_where_they_are_traced():
+    bare = TexturedMaterial([0.3, 0.03, 0.08], 0.0, 0.8)
+    relit = prt.precompute(spheres(bare), refine=False, system="lobe", size=16, progress=False)
+    light = builtin.studio(size=16)
+
+    @jax.jit
+    def radiance(coat, color):
+        new = dataclasses.replace(bare, clearcoat=coat, sheen_color=color * jnp.ones(3), sheen_roughness=0.4)
+        return relit.radiance(light, eye=EYE, materials={"ball 0": new})
+
+    plain = relit.radiance(light, eye=EYE)
+    np.testing.assert_allclose(radiance(0.0, 0.0), plain, rtol=1e-4, atol=1e-6)
+    assert np.isnan(radiance(0.5, 0.0)).all()
+    assert np.isnan(radiance(0.0, 0.5)).all()
+
+
+@pytest.mark.parametrize("material", [COATED, VELVET], ids=["coat", "sheen"])
+def test_relit_scenes_with_layers_can_be_saved(material, tmp_path):
+    relit = prt.precompute(spheres(material), refine=False, system="lobe", size=16, progress=False)
+    prt.files.save(tmp_path / "saved", relit)
+    again, light = prt.files.load(tmp_path / "saved"), builtin.studio(size=16)
+    eye = EYE
+    np.testing.assert_array_equal(again.radiance(light, eye=eye), relit.radiance(light, eye=eye))
+    new = {"ball 0": dataclasses.replace(material, roughness=0.3)}
+    changed = again.radiance(light, eye=eye, materials=new)
+    np.testing.assert_array_equal(changed, relit.radiance(light, eye=eye, materials=new))
+
+
+def test_another_transmission_or_opacity_is_refused():
+    glass = TexturedMaterial(0.5, 0.0, 0.4, transmission=0.5)
+    relit = prt.precompute(spheres(glass), refine=False, system="lobe", size=16, progress=False)
+    light = builtin.studio(size=16)
+    for new, text in (
+        (dataclasses.replace(glass, transmission=0.0), r"a transmission of 0\.5, got a material of 0"),
+        (
+            dataclasses.replace(glass, alpha_mode="blend", alpha=0.5),
+            "the alpha mode 'opaque', got a material of 'blend'",
+        ),
+    ):
+        with pytest.raises(ValueError, match=f"part 'ball 0' was precomputed with {text}"):
+            relit.radiance(light, eye=EYE, materials={"ball 0": new})
+
+
 def test_a_clear_coat_hides_a_sheen_with_a_warning():
     both = dataclasses.replace(COATED, sheen_color=jnp.ones(3), sheen_roughness=0.3)
     with pytest.warns(UserWarning, match="the sheen of part 'ball 0' is left out: it has a clear coat"):
@@ -294,6 +338,16 @@ def test_materials_without_standard_tables_lose_their_coat_with_a_warning():
     assert shading.table is None
     bare = channels.of_part(spheres(dataclasses.replace(brushed, clearcoat=0.0)).parts[0])
     np.testing.assert_allclose(shading.blend.weight, bare.blend.weight, rtol=1e-4)
+
+
+def test_pictures_are_without_a_coat_that_is_left_out():
+    plain, light = spheres(dataclasses.replace(COATED, clearcoat=0.0)), builtin.studio(size=16)
+    camera = prt.scene.camera.orbit(plain.mesh, width=32, height=32)
+    options = {"refine": False, "system": prt.relit.Harmonics(degree=5), "size": 16, "progress": False}
+    with pytest.warns(UserWarning, match="the clear coat of part 'ball 0' is left out"):
+        coated = prt.precompute(spheres(COATED), **options)
+    pictures = [relit.picture(light, camera) for relit in (coated, prt.precompute(plain, **options))]
+    np.testing.assert_allclose(*pictures, rtol=1e-3, atol=1e-4)
 
 
 def test_materials_made_while_jax_traces_have_no_layers():

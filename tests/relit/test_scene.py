@@ -3,6 +3,7 @@
 The scene is a floor of a textured material, a ball of a plain BRDF above it, and an ideally diffuse wall behind.
 """
 
+import dataclasses
 import functools
 import pathlib
 import re
@@ -16,7 +17,7 @@ import pytest
 import jaxprt as prt
 from jaxprt import bounces, bright_texels, harmonic, lobe, separable, visibility
 from jaxprt.brdf import CookTorrance, Lambert
-from jaxprt.image import raster, sky
+from jaxprt.image import automatic_exposure, raster, sky
 from jaxprt.relit import Clusters, Harmonics, Lobes, RelitScene, Terms, measuring, reflection
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.recipes import SYSTEMS
@@ -402,6 +403,19 @@ def test_exposure_is_of_the_surfaces_whatever_is_behind_them():
     assert float(ready.exposure(picture, CAMERA)) == pytest.approx(np.log2(0.9 / bright), abs=1e-4)
     with pytest.raises(ValueError, match=r"picture must have the camera's 16 x 24 pixels .* got 24 x 16"):
         ready.exposure(jnp.ones((24, 16, 3)), CAMERA)
+
+
+def test_exposure_is_not_of_lamps():
+    ball, lamp = mesh("ball"), mesh("ball")
+    lamp = dataclasses.replace(lamp, position=np.asarray(lamp.position) + np.float32([0, 2.5, 0]))
+    glow = TexturedMaterial(0.5, 0.0, 1.0, specular=0.0, emissive=20.0)
+    parts = [Part("ball", ball, TexturedMaterial(0.5, 0.0, 1.0, specular=0.0)), Part("lamp", lamp, glow)]
+    ready = prt.precompute(Scene(parts), system="lobe", size=8, refine=False, progress=False)
+    camera = orbit(ready.mesh, width=32, height=32)
+    picture = ready.picture(light(), camera)
+    stops, below = ready.exposure(picture, camera), automatic_exposure(picture[18:])
+    assert float(stops) == pytest.approx(float(below), abs=0.3)
+    assert float(stops) > float(automatic_exposure(picture)) + 2
 
 
 def test_the_camera_is_the_scenes_first_or_one_that_sees_all():

@@ -153,8 +153,8 @@ class MaterialReader:
         """Some channels of a texture; None if there is no texture that can be read."""
         if key not in item:
             return None
-        document, owner = self._document, f"{key} of {owner}"
-        info = document.object(item, key, owner)
+        document = self._document
+        info, owner = document.object(item, key, owner), f"{key} of {owner}"
         index = document.index("textures", info.get("index"), owner)
         texture, name = document.items("textures")[index], f"texture {index}"
         moved = document.object(document.object(info, "extensions", owner), "KHR_texture_transform", owner)

@@ -26,7 +26,8 @@ from jaxprt.systems.standard import tables
 from jaxprt.systems.standard.tables import METALLIC_ROUGHNESS, SHEEN, StandardTable
 
 BASE = 4  # number of terms of the base
-TERM = tuple(range(2 * BASE + 1))  # indices of the channels
+# Coefficients of a `Look`: terms of the base, terms under a coat and the coat, terms under a sheen and the sheen.
+_UNDER_COAT, _UNDER_SHEEN, COLUMNS = BASE, 2 * BASE + 1, 3 * BASE + 2
 _MIRROR = 1  # index of the term of metallic-roughness whose lobe is that of a coat
 _WHITE = 3  # index of the ideally diffuse term
 _VIEWS = np.sqrt((np.arange(16) + 0.5) / 16)  # cosines of views, uniform in projected solid angle
@@ -36,6 +37,7 @@ class Layer(NamedTuple):
     """What lies over a material.
 
     Attributes:
+        first: Index of the first of its coefficients.
         table: The table with the lobe of the layer.
         channel: Index of its channel there.
         taken: Share of the light that a full layer takes from what is under it, at cosines of views, for each
@@ -44,6 +46,7 @@ class Layer(NamedTuple):
             has its own albedo.
     """
 
+    first: int
     table: StandardTable
     channel: int
     taken: Callable[[Float[np.ndarray, " v"], Float[np.ndarray, " n"]], Float[np.ndarray, "n v"]]
@@ -61,6 +64,12 @@ def _of_coat(cosine: np.ndarray, knot: np.ndarray) -> np.ndarray:
 
 def _of_sheen(cosine: np.ndarray, knot: np.ndarray) -> np.ndarray:
     return sheen_albedo(cosine, np.exp(knot)[:, None])
+
+
+LAYERS = {
+    "clear coat": Layer(_UNDER_COAT, METALLIC_ROUGHNESS, _MIRROR, _of_coat, reflects=True),
+    "sheen": Layer(_UNDER_SHEEN, SHEEN, 0, _of_sheen, reflects=False),
+}
 
 
 class LayeredFamily(eqx.Module):
@@ -90,10 +99,15 @@ class LayeredTable(StandardTable):
     Where that takes the logarithm of a roughness, this takes those of the base and of the layer.
 
     Attributes:
-        layer: The layer.
+        over: Name of the layer, one of `LAYERS`.
     """
 
-    layer: Layer
+    over: str
+
+    @property
+    def layer(self) -> Layer:
+        """The layer."""
+        return LAYERS[self.over]
 
     @property
     def scale(self) -> Float[np.ndarray, " k"]:
@@ -103,8 +117,8 @@ class LayeredTable(StandardTable):
 
     @property
     def term(self) -> tuple[int, ...]:
-        """Indices of the channels."""
-        return TERM
+        """Indices of the channels among the coefficients of a `Look`."""
+        return (*range(BASE), *range(self.layer.first, self.layer.first + BASE + 1))
 
     @property
     def knots(self) -> tuple[np.ndarray, ...]:
@@ -119,18 +133,18 @@ class LayeredTable(StandardTable):
     def lobes(self, count: int = tables.LOBES) -> LobeBrdf:
         """The BRDF as lobes: `count` for the base, and as many for the layer."""
         require.count("count", count, least=1)
-        return _lobes(self.layer, int(count), jnp.result_type(float))
+        return _lobes(self.over, int(count), jnp.result_type(float))
 
     def harmonics(self, degree: int = tables.DEGREE) -> HarmonicBrdf:
         """The BRDF in spherical harmonics up to a degree."""
-        return _harmonics(self.layer, degree, jnp.result_type(float))
+        return _harmonics(self.over, degree, jnp.result_type(float))
 
     def paths(self) -> tuple[SeparableBrdf, Sent]:
         """The functions with which parts send light to others, and their weights over both roughnesses.
 
         Others receive the light of a sheen as that of a matte surface of the same albedo.
         """
-        return _paths(self.layer, jnp.result_type(float))
+        return _paths(self.over, jnp.result_type(float))
 
     def curvature(self, log_roughness: Any, weight: Float[np.ndarray, " k"], degree: int | None = None) -> float:
         """RMS Laplacian of radiance over the mirror direction: that of base or layer, whichever is larger."""
@@ -145,7 +159,7 @@ class LayeredTable(StandardTable):
 
     def is_sharp(self, log_roughness: Any, weight: Float[np.ndarray, " k"] | None = None) -> bool:
         """Whether lobes of base and layer together are narrow enough to be traced."""
-        weight = np.ones(len(TERM)) if weight is None else np.asarray(weight, np.float64)
+        weight = np.ones(2 * BASE + 1) if weight is None else np.asarray(weight, np.float64)
         each = zip(
             (METALLIC_ROUGHNESS, self.layer.table), log_roughness, self._apart(log_roughness[1], weight), strict=True
         )
@@ -164,8 +178,8 @@ class LayeredTable(StandardTable):
         return METALLIC_ROUGHNESS._stored
 
 
-COATED = LayeredTable("coated metallic_roughness", Layer(METALLIC_ROUGHNESS, _MIRROR, _of_coat, reflects=True))
-SHEENED = LayeredTable("metallic_roughness under a sheen", Layer(SHEEN, 0, _of_sheen, reflects=False))
+COATED = LayeredTable("metallic_roughness under a clear coat", "clear coat")
+SHEENED = LayeredTable("metallic_roughness under a sheen", "sheen")
 
 
 def _cosine(tangent: np.ndarray) -> np.ndarray:
@@ -188,7 +202,8 @@ def _under(base: Any, layer: Any, taken: np.ndarray) -> np.ndarray:
 
 
 @functools.cache
-def _lobes(layer: Layer, count: int, dtype: Any) -> LobeBrdf:
+def _lobes(over: str, count: int, dtype: Any) -> LobeBrdf:
+    layer = LAYERS[over]
     base, own = METALLIC_ROUGHNESS.lobes(count), layer.table.lobes(count)
     cosine = _cosine(np.linspace(0, 1, base.scale.shape[-1]))
     taken, sent = layer.taken(cosine, layer.table.knot), layer.sent(cosine)
@@ -212,7 +227,8 @@ def _lobes(layer: Layer, count: int, dtype: Any) -> LobeBrdf:
 
 
 @functools.cache
-def _harmonics(layer: Layer, degree: int, dtype: Any) -> HarmonicBrdf:
+def _harmonics(over: str, degree: int, dtype: Any) -> HarmonicBrdf:
+    layer = LAYERS[over]
     base, own = METALLIC_ROUGHNESS.harmonics(degree), layer.table.harmonics(degree)
     cosine, knot = _cosine(np.arange(base.table.shape[-1]) / base.steps), np.asarray(own.knot[0], np.float64)
     taken = layer.taken(cosine, knot)
@@ -226,7 +242,8 @@ def _harmonics(layer: Layer, degree: int, dtype: Any) -> HarmonicBrdf:
 
 
 @functools.cache
-def _paths(layer: Layer, dtype: Any) -> tuple[SeparableBrdf, Sent]:
+def _paths(over: str, dtype: Any) -> tuple[SeparableBrdf, Sent]:
+    layer = LAYERS[over]
     brdf, sent = METALLIC_ROUGHNESS.paths()
     factor, knot = np.asarray(sent.factor), layer.table.knot
     taken = layer.taken(_VIEWS, knot).mean(1)
