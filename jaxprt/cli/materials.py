@@ -30,6 +30,7 @@ MODELS: dict[str, type] = {
     "poulin-fournier-grooves": brdf.PoulinFournierGrooves,
     "ggx": brdf.GGX,
     "ggx-interface": brdf.GGXInterface,
+    "charlie": brdf.Charlie,
     "metallic-roughness": TexturedMaterial,
 }
 # Loader of each kind of file, and its further options: True for required ones.

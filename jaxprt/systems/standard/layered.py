@@ -33,7 +33,7 @@ _WHITE = 3  # index of the ideally diffuse term
 _VIEWS = np.sqrt((np.arange(16) + 0.5) / 16)  # cosines of views, uniform in projected solid angle
 
 
-class Layer(NamedTuple):
+class _Layer(NamedTuple):
     """What lies over a material.
 
     Attributes:
@@ -66,9 +66,9 @@ def _of_sheen(cosine: np.ndarray, knot: np.ndarray) -> np.ndarray:
     return sheen_albedo(cosine, np.exp(knot)[:, None])
 
 
-LAYERS = {
-    "clear coat": Layer(_UNDER_COAT, METALLIC_ROUGHNESS, _MIRROR, _of_coat, reflects=True),
-    "sheen": Layer(_UNDER_SHEEN, SHEEN, 0, _of_sheen, reflects=False),
+_LAYERS = {
+    "clear coat": _Layer(_UNDER_COAT, METALLIC_ROUGHNESS, _MIRROR, _of_coat, reflects=True),
+    "sheen": _Layer(_UNDER_SHEEN, SHEEN, 0, _of_sheen, reflects=False),
 }
 
 
@@ -99,15 +99,15 @@ class LayeredTable(StandardTable):
     Where that takes the logarithm of a roughness, this takes those of the base and of the layer.
 
     Attributes:
-        over: Name of the layer, one of `LAYERS`.
+        over: Name of the layer, "clear coat" or "sheen".
     """
 
     over: str
 
     @property
-    def layer(self) -> Layer:
+    def layer(self) -> _Layer:
         """The layer."""
-        return LAYERS[self.over]
+        return _LAYERS[self.over]
 
     @property
     def scale(self) -> Float[np.ndarray, " k"]:
@@ -203,7 +203,7 @@ def _under(base: Any, layer: Any, taken: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def _lobes(over: str, count: int, dtype: Any) -> LobeBrdf:
-    layer = LAYERS[over]
+    layer = _LAYERS[over]
     base, own = METALLIC_ROUGHNESS.lobes(count), layer.table.lobes(count)
     cosine = _cosine(np.linspace(0, 1, base.scale.shape[-1]))
     taken, sent = layer.taken(cosine, layer.table.knot), layer.sent(cosine)
@@ -228,7 +228,7 @@ def _lobes(over: str, count: int, dtype: Any) -> LobeBrdf:
 
 @functools.cache
 def _harmonics(over: str, degree: int, dtype: Any) -> HarmonicBrdf:
-    layer = LAYERS[over]
+    layer = _LAYERS[over]
     base, own = METALLIC_ROUGHNESS.harmonics(degree), layer.table.harmonics(degree)
     cosine, knot = _cosine(np.arange(base.table.shape[-1]) / base.steps), np.asarray(own.knot[0], np.float64)
     taken = layer.taken(cosine, knot)
@@ -243,7 +243,7 @@ def _harmonics(over: str, degree: int, dtype: Any) -> HarmonicBrdf:
 
 @functools.cache
 def _paths(over: str, dtype: Any) -> tuple[SeparableBrdf, Sent]:
-    layer = LAYERS[over]
+    layer = _LAYERS[over]
     brdf, sent = METALLIC_ROUGHNESS.paths()
     factor, knot = np.asarray(sent.factor), layer.table.knot
     taken = layer.taken(_VIEWS, knot).mean(1)
