@@ -372,10 +372,12 @@ def _check_opacity(part: Part, material: TexturedMaterial) -> None:
             f"part {part.name!r} was precomputed with a transmission of {old:g}, got a material of {new:g}: precompute "
             "the scene with it, because light passes through"
         )
-    if material.alpha_mode not in (before.alpha_mode, "opaque"):
+    same = material.alpha_mode == before.alpha_mode and abs(float(material.alpha) - float(before.alpha)) <= _EQUAL
+    if material.alpha_mode != "opaque" and not same:
         raise ValueError(
-            f"part {part.name!r} was precomputed with the alpha mode {before.alpha_mode!r}, got a material of "
-            f"{material.alpha_mode!r}: precompute the scene with it, because light passes through"
+            f"part {part.name!r} was precomputed with the alpha mode {before.alpha_mode!r} and an alpha of "
+            f"{float(before.alpha):g}, got a material of {material.alpha_mode!r} and {float(material.alpha):g}: "
+            "precompute the scene with it, because light passes through"
         )
 
 

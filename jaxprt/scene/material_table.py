@@ -232,8 +232,8 @@ def _layered(look: Look, layers: Layers, coated: Bool[Array, " p"]) -> Look:
     base = look.coefficient * jnp.stack([passing, jnp.ones_like(coat), jnp.ones_like(coat), passing], 1)[..., None]
     color = jnp.where(coated[:, None], 0, layers.sheen_color)
     weight, most = coat[:, None, None], jnp.max(color, 1)[:, None, None]
-    over_base = jnp.broadcast_to(weight, (len(coat), 1, 3)), color[:, None]
-    rows = (1 - weight - most) * base, weight * base, over_base[0], most * base, over_base[1]
+    gray = jnp.broadcast_to(weight, (len(coat), 1, 3))
+    rows = (1 - weight - most) * base, weight * base, gray, most * base, color[:, None]
     coefficient = jnp.concatenate(rows, 1)
     roughness = jnp.where(
         jnp.any(color > 0, 1),

@@ -27,7 +27,7 @@ from jaxprt.systems.standard.tables import METALLIC_ROUGHNESS, SHEEN, StandardTa
 
 BASE = 4  # number of terms of the base
 # Coefficients of a `Look`: terms of the base, terms under a coat and the coat, terms under a sheen and the sheen.
-_UNDER_COAT, _UNDER_SHEEN, COLUMNS = BASE, 2 * BASE + 1, 3 * BASE + 2
+_UNDER_COAT, _UNDER_SHEEN = BASE, 2 * BASE + 1
 _MIRROR = 1  # index of the term of metallic-roughness whose lobe is that of a coat
 _WHITE = 3  # index of the ideally diffuse term
 _VIEWS = np.sqrt((np.arange(16) + 0.5) / 16)  # cosines of views, uniform in projected solid angle
