@@ -5,8 +5,10 @@ With C the color of the sheen, alpha = sheen_roughness^2, h the half vector and 
     value = C D V + (1 - max_c(C) E(wo)) base,
     D = (2 + 1 / alpha) s^(1 / alpha) / (2 pi),    V = 1 / (4 cos_i cos_o (1 + L(cos_i) + L(cos_o))).
 
-L is the masking of the fibers, a fit over alpha. E(wo) is the albedo of D V towards the view, at most 1. As in the
-simplified form of the extension's text, the base is dimmed by the view alone, so the value is not reciprocal.
+L is the masking of the fibers: L(x) = exp(l(x)) up to x = 0.5 and exp(2 l(0.5) - l(1 - x)) beyond, with
+l(x) = a / (1 + b x^c) + d x + e, whose coefficients depend on alpha. E(wo) is the albedo of D V towards the view, at
+most 1. As in the simplified form of the extension's text, the base is dimmed by the view alone, so the value is not
+reciprocal.
 
 An alpha below 0.01 (a roughness below 0.1) is replaced by 0.01: such a sheen is seen in the last six degrees above the
 horizon only.
@@ -29,7 +31,7 @@ from jaxprt.brdf.models import Model, both_above, color, half_vector, scalar
 
 SMOOTHEST = 0.1  # smaller roughness is treated as this one
 _TINY = 1e-20
-# Of L(x) = a / (1 + b x^c) + d x + e: values at alpha 1, and at 0.
+# Coefficients a to e of l, each where alpha is 1 and where it is 0. Between, they are linear in (1 - alpha)^2.
 _MASKING = (
     (21.5473, 25.3245),
     (3.82987, 3.32435),
@@ -102,7 +104,15 @@ def _albedos() -> Float[np.ndarray, "r v"]:
 
 
 def sheen_albedo(cosine: Float[Array | np.ndarray, "*b"], roughness: Any) -> Any:
-    """E: albedo of a sheen of color 1 towards views at some cosines to the normal, at most 1."""
+    """E of the module's equation: albedo of a sheen of color 1, at most 1.
+
+    Args:
+        cosine: Cosines of the views to the normal.
+        roughness: Perceptual roughness of the sheen; one number, or an array that broadcasts.
+
+    Returns:
+        The albedo [*b], interpolated in a table: .009 off at most, half a degree above the horizon.
+    """
     xp: Any = np if isinstance(cosine, np.ndarray) else jnp
     table = xp.asarray(_albedos(), cosine.dtype)
     cosine = xp.clip(cosine, 0, 1)
@@ -157,5 +167,5 @@ class Sheen(eqx.Module):
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the BRDF in 1/sr."""
         most = jnp.max(self.sheen_color, -1)
-        kept = 1 - most * sheen_albedo(wo[..., 2], self.sheen_roughness)
-        return kept[..., None] * self.base(wi, wo) + self.sheen_color * Charlie(self.sheen_roughness)(wi, wo)
+        transmitted = 1 - most * sheen_albedo(wo[..., 2], self.sheen_roughness)
+        return transmitted[..., None] * self.base(wi, wo) + self.sheen_color * Charlie(self.sheen_roughness)(wi, wo)

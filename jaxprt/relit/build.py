@@ -118,8 +118,8 @@ def precompute(
     recipes = [_recipe(system, part.name, scene) for part in scene.parts]
     near = centered(scene)
     shadings = shaded(near.parts, recipes)
-    kept = [channels.as_shaded(part, shading) for part, shading in zip(scene.parts, shadings, strict=True)]
-    scene = dataclasses.replace(scene, parts=kept)
+    pairs = zip(scene.parts, shadings, strict=True)
+    scene = dataclasses.replace(scene, parts=[channels.as_shaded(part, shading) for part, shading in pairs])
     mesh, whole = near.mesh, scene.mesh
     warn.of_gain(near, shadings)
     warn.of_shells(near)

@@ -575,14 +575,15 @@ class RelitScene(System):
         return automatic_exposure(picture, coverage=coverage)
 
     def _glowing(self, camera: Camera) -> Bool[np.ndarray, "h w"]:
-        """Whether the middle of each pixel shows a surface that emits."""
-        columns = zip(self.shading, self.place.counts, strict=True)
-        emits = [
-            np.zeros(count) if each.emitted is None else np.asarray(each.emitted).max(1) for each, count in columns
+        """Whether the middle of each pixel shows a triangle with a vertex that emits."""
+        parts = zip(self.shading, self.place.counts, strict=True)
+        emitted = [
+            np.zeros(count) if shading.emitted is None else np.asarray(shading.emitted).max(1)
+            for shading, count in parts
         ]
-        glowing = np.max(np.concatenate(emits)[np.asarray(self.mesh.face)], 1) > 0
-        seen = np.asarray(raster.rasterize(self.mesh, camera).triangle)
-        return (seen >= 0) & glowing[np.maximum(seen, 0)]
+        glowing = np.max(np.concatenate(emitted)[np.asarray(self.mesh.face)], 1) > 0
+        triangle = np.asarray(raster.rasterize(self.mesh, camera).triangle)
+        return (triangle >= 0) & glowing[np.maximum(triangle, 0)]
 
     def _picture_view(self, camera: Camera | None, materials, **options: Any) -> PictureView:
         camera = self.camera if camera is None else camera

@@ -17,6 +17,8 @@ from jaxprt.systems import bounces, standard
 from jaxprt.systems.protocol import Blend
 from jaxprt.view.bases import without_layers
 
+# Of the table of albedos of sheens: above three degrees over the horizon, and below, where views of the last step are.
+ALBEDO, ALBEDO_AT_HORIZON = 0.004, 0.009
 TABLE = 0.03  # error of 12 and 12 lobes, of light of medium width
 EYE = np.array([0.0, 0.0, 5.0])
 COATED = TexturedMaterial([0.6, 0.1, 0.1], 0.0, 0.5, clearcoat=0.8, clearcoat_roughness=0.2)
@@ -80,7 +82,10 @@ def test_a_sheen_is_that_of_the_text_of_the_extension(roughness):
     each = np.stack(np.broadcast_arrays(sine * np.cos(turn), sine * np.sin(turn), cosine), -1)
     area = share * (middle + 1) / 2 * cosine[:, 0] * 2 * np.pi
     albedo = np.array([area @ fibers(each, view, roughness).mean(1) for view in wo])
-    np.testing.assert_allclose(sheen_albedo(wo[:, 2], roughness), np.minimum(albedo, 1), atol=0.01)
+    error = np.abs(np.asarray(sheen_albedo(wo[:, 2], roughness)) - np.minimum(albedo, 1))
+    low = wo[:, 2] < 0.05
+    assert error[~low].max() < ALBEDO
+    assert error[low].max() < ALBEDO_AT_HORIZON
     value = fibers(wi, wo, roughness)[:, None]
     wi, wo = jnp.asarray(wi), jnp.asarray(wo)
     np.testing.assert_allclose(Charlie(roughness)(wi, wo), value, rtol=2e-4, atol=1e-7)
@@ -127,7 +132,9 @@ def test_other_parts_receive_the_light_that_a_layer_reflects(table):
     place = jnp.log(jnp.asarray([0.5])), jnp.log(jnp.asarray([0.4]))
     found = value @ np.asarray(sent.weights(Blend(jnp.eye(9)[None], place)))[0]
     exact = paths.channels(table.family(place[0][0], place[1][0]))
-    np.testing.assert_allclose(found, exact, rtol=0.05, atol=5e-3)
+    rim = 6  # under the layer: it is bright where the layer takes most, and the mean of the product is smaller
+    np.testing.assert_allclose(np.delete(found, rim), np.delete(exact, rim), rtol=0.035)
+    assert 1 < found[rim] / exact[rim] < 1.25
 
 
 def test_harmonics_of_coated_materials_are_those_of_base_and_coat():
@@ -144,7 +151,7 @@ def test_harmonics_of_coated_materials_are_those_of_base_and_coat():
     share = np.asarray(sheen_albedo(np.asarray(wo[:, 2]), 0.15))
     velvet = standard.SHEEN.harmonics(4).coefficients(wo, log_layer)
     np.testing.assert_allclose(ours[:, :4], base, atol=1e-5 * np.abs(expected).max())
-    np.testing.assert_allclose(ours[:, 4:8], (1 - share) * base, atol=0.005 * np.abs(base).max())
+    np.testing.assert_allclose(ours[:, 4:8], (1 - share) * base, atol=4e-4 * np.abs(base).max())
     np.testing.assert_allclose(ours[:, 8:], velvet, atol=1e-5)
 
 
@@ -243,7 +250,7 @@ def test_relit_scenes_with_sheens_are_the_exact_sum():
     exact = np.asarray(prt.reference.radiance(part.mesh, relit.shading[0].exact, light, eye=eye, occluder=scene.mesh))
     way = eye - np.asarray(part.mesh.position)
     cosine = np.einsum("vc,vc->v", way, np.asarray(part.mesh.normal)) / np.linalg.norm(way, axis=1)
-    assert np.linalg.norm((ours - exact)[cosine > 0.1]) < 0.035 * np.linalg.norm(exact[cosine > 0.1])
+    assert np.linalg.norm((ours - exact)[cosine > 0.1]) < 0.033 * np.linalg.norm(exact[cosine > 0.1])
     bare = dataclasses.replace(VELVET, sheen_color=jnp.zeros(3))
     alone = prt.precompute(spheres(bare), refine=False, system="lobe", size=16, progress=False)
     without = relit.radiance(light, eye=eye, materials={"ball 0": bare})

@@ -51,7 +51,7 @@ class Material(NamedTuple):
         first: Roughness from which on descent improves the lobes.
         knot: Knots of the harmonics.
         power: Power of the roughness to which the width of lobes is proportional.
-        knots_in_all: Number of knots of everything but the harmonics.
+        knot_count: Number of knots of everything but the harmonics.
     """
 
     family: RoughnessFamily | ShininessFamily | SheenFamily
@@ -61,12 +61,12 @@ class Material(NamedTuple):
     first: float
     knot: np.ndarray
     power: int
-    knots_in_all: int = KNOTS
+    knot_count: int = KNOTS
 
     @property
     def knots(self) -> np.ndarray:
         """Knots of everything but the harmonics, evenly spaced in the logarithm of roughness."""
-        return np.linspace(np.log(self.smoothest), 0, self.knots_in_all)
+        return np.linspace(np.log(self.smoothest), 0, self.knot_count)
 
 
 def material(name: str) -> Material:

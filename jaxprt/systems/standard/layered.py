@@ -148,10 +148,8 @@ class LayeredTable(StandardTable):
 
     def curvature(self, log_roughness: Any, weight: Float[np.ndarray, " k"], degree: int | None = None) -> float:
         """RMS Laplacian of radiance over the mirror direction: that of base or layer, whichever is larger."""
-        each = zip(
-            (METALLIC_ROUGHNESS, self.layer.table), log_roughness, self._apart(log_roughness[1], weight), strict=True
-        )
-        return max(table.curvature(place, own, degree) for table, place, own in each if np.any(own))
+        rows = self._apart(log_roughness, weight)
+        return max(table.curvature(place, part, degree) for table, place, part in rows if np.any(part))
 
     def samples(self, log_roughness: Any, size: int = tables.TEXELS) -> int:
         """Samples along the edge of a texel, for the smoother one of base and coat. A sheen needs one."""
@@ -160,18 +158,19 @@ class LayeredTable(StandardTable):
     def is_sharp(self, log_roughness: Any, weight: Float[np.ndarray, " k"] | None = None) -> bool:
         """Whether lobes of base and layer together are narrow enough to be traced."""
         weight = np.ones(2 * BASE + 1) if weight is None else np.asarray(weight, np.float64)
-        each = zip(
-            (METALLIC_ROUGHNESS, self.layer.table), log_roughness, self._apart(log_roughness[1], weight), strict=True
-        )
-        return tables.is_traced(np.sum([table.albedos(place, own) for table, place, own in each], 0))
+        rows = self._apart(log_roughness, weight)
+        return tables.is_traced(np.sum([table.albedos(place, part) for table, place, part in rows], 0))
 
-    def _apart(self, log_layer: float, weight: Float[np.ndarray, " k"]) -> tuple[np.ndarray, np.ndarray]:
-        """Mean weights of the terms of the base, and of the channels of the layer's table."""
+    def _apart(
+        self, log_roughness: Any, weight: Float[np.ndarray, " k"]
+    ) -> list[tuple[StandardTable, float, np.ndarray]]:
+        """The tables of base and layer, the logarithm of the roughness of each, and mean weights of their channels."""
         weight, layer = np.asarray(weight, np.float64), self.layer
-        taken = layer.taken(_VIEWS, np.array([log_layer])).mean()
-        own = np.zeros(len(layer.table.scale))
-        own[layer.channel] = weight[-1] * (taken if layer.reflects else 1)
-        return weight[:BASE] + (1 - taken) * weight[BASE : 2 * BASE], own
+        taken = layer.taken(_VIEWS, np.array([log_roughness[1]])).mean()
+        above = np.zeros(len(layer.table.scale))
+        above[layer.channel] = weight[-1] * (taken if layer.reflects else 1)
+        base = weight[:BASE] + (1 - taken) * weight[BASE : 2 * BASE]
+        return [(METALLIC_ROUGHNESS, log_roughness[0], base), (layer.table, log_roughness[1], above)]
 
     @property
     def _stored(self) -> Any:
