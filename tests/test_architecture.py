@@ -51,8 +51,8 @@ ONLY_IN = {
     "IPython": "jaxprt.view.widget",
     "anywidget": "jaxprt.view.widget",
     "traitlets": "jaxprt.view.widget",
-    "DracoPy": "jaxprt.scene.formats.gltf_draco",
-    "meshopt": "jaxprt.scene.formats.gltf_meshopt",
+    "DracoPy": "jaxprt.scene.formats.gltf_geometry",
+    "meshopt": "jaxprt.scene.formats.gltf_file",
     "opengl_basisu": "jaxprt.files.ktx2",
     "fast_simplification": "jaxprt.scene.occluder",
 }

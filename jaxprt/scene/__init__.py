@@ -16,10 +16,10 @@ from jaxprt.scene import (
 )
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Environment, load_environment
-from jaxprt.scene.formats.scene_file import load_scene
+from jaxprt.scene.formats.scene_file import load_mesh, load_scene
 from jaxprt.scene.light_probes import irradiance, light_probe
 from jaxprt.scene.material import Texture, TexturedMaterial
-from jaxprt.scene.mesh import Mesh, load_mesh
+from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.scene import Part, PointLight, Scene
 from jaxprt.scene.suns import Sun, with_suns
 

@@ -15,7 +15,6 @@ from jaxtyping import Array, Float, Int, Integer
 from jaxprt import require
 from jaxprt.scene import mesh_arrays
 from jaxprt.scene import origin as origins
-from jaxprt.scene.formats import mesh_file
 from jaxprt.scene.formats.geometry import Geometry, rows_of
 from jaxprt.scene.normals import vertex_normals
 from jaxprt.scene.opacity import Opacity
@@ -59,42 +58,6 @@ class Mesh(eqx.Module):
 
 
 @require.arguments(path=partial(require.path, "path"))
-def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
-    """Loads a mesh from a PLY, OBJ, STL, OFF, GLB or glTF file. `load_scene` also reads materials and images.
-
-    Positions are read in double precision. If the mesh is far from zero, they become relative to `Mesh.origin` before
-    they are rounded to float32. Vertices and faces keep the order of the file, and no vertices are merged. Polygons are
-    divided into triangles of the same orientation: convex ones into fans, concave ones by ear clipping. A vertex is
-    split where its corners differ in what the file states for corners or faces: normals or texture coordinates. All
-    meshes of a glTF file's default scene are transformed by their nodes and joined, and its tangents are kept. Its
-    buffers must be in its folder; `load_scene` can read others. Texture coordinates are 0 where only some faces of the
-    file have them or they are not finite. OBJ faces that refer to texture coordinates or normals that do not exist are
-    loaded without them, with a warning. Triangle strips of PLY files become triangles.
-
-    Normals come from the file. Where they are absent, zero or NaN, they are means of the adjacent face normals,
-    weighted by angle. Vertices split at a seam share such a mean unless they form a crease of more than about 80
-    degrees. STL files have no shared vertices, so their vertices get the flat normals of their faces. So do primitives
-    of glTF files without normals, whose triangles get vertices of their own, as the specification says.
-
-    Args:
-        path: The file.
-        groups: Whether regions are the objects and groups of an OBJ file or the nodes of a glTF file, instead of
-            materials.
-
-    Returns:
-        The mesh. The regions of an OBJ file are numbered by first appearance, and so are those of a PLY file, which are
-        its images. Those of a glTF file are in the order of its materials, with parts without material last, or with
-        `groups` in the order of its nodes.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        ValueError: The file is of an unknown kind, damaged or empty, has positions that are not finite, or faces that
-            refer to missing vertices. An OBJ file truncated between two faces cannot be detected.
-    """
-    path = pathlib.Path(path)
-    return from_file(mesh_file.read(path, groups=groups), path)
-
-
 def from_file(geometry: Geometry, path: pathlib.Path) -> Mesh:
     """A mesh from the geometry of a file, with the normals and checks of `load_mesh`."""
     frame, welded = (geometry.normal, geometry.tangent), path.suffix.lower() != ".stl"

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from jaxprt.scene.mesh import load_mesh, split
+from jaxprt.scene.formats.scene_file import load_mesh
+from jaxprt.scene.mesh import split
 from jaxprt.sphere import directions
 
 # Vertices, faces and regions; the first two as data/README.md has them.

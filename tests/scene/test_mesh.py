@@ -8,7 +8,8 @@ import pytest
 import trimesh
 
 from jaxprt.scene import builtin
-from jaxprt.scene.mesh import Mesh, brush, ground_plane, join, load_mesh, make_mesh, rotate, split
+from jaxprt.scene.formats.scene_file import load_mesh
+from jaxprt.scene.mesh import Mesh, brush, ground_plane, join, make_mesh, rotate, split
 from jaxprt.sphere import directions
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])

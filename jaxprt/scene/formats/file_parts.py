@@ -1,4 +1,4 @@
-"""Conversion of the geometry of a file to parts: one for each region, with the tangents that its material needs."""
+"""Parts of scenes from files: images of textures, materials of files that have none, and one mesh for each material."""
 
 import pathlib
 from collections.abc import Sequence
@@ -9,11 +9,134 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxprt import require
+from jaxprt.files import images, inputs
 from jaxprt.scene import texture
-from jaxprt.scene.formats.geometry import Geometry, rows_of
-from jaxprt.scene.material import TexturedMaterial
+from jaxprt.scene.formats.geometry import Geometry, MeshContent, rows_of
+from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.mesh import Mesh, brush, from_file, split
 from jaxprt.scene.scene import Part, numbered
+
+_GRAY = 0.5  # base color of surfaces without material and color
+
+
+class TextureImages:
+    """Reads the image files of a scene. An image that several textures share is decoded and stored only once."""
+
+    def __init__(self):
+        self._image: dict[tuple[pathlib.Path, bool, tuple[int, ...]], jax.Array | ValueError] = {}
+
+    def read(self, path: pathlib.Path, channels: tuple[int, ...], *, decoded: bool) -> jax.Array:
+        """Some channels of an image.
+
+        Args:
+            path: The file.
+            channels: Numbers of the channels. Of gray images, each is the gray.
+            decoded: Whether integers are decoded from sRGB.
+
+        Raises:
+            FileNotFoundError: The file does not exist.
+            ValueError: It is not a regular file, or damaged.
+            MemoryError: The image does not fit into memory.
+        """
+        inputs.check(path, "an image file")
+        key = path.resolve(), decoded, channels
+        if key not in self._image:
+            try:
+                pixels = images.decode_image(inputs.content(path, "an image file"), name=str(path), decoded=decoded)
+            except ValueError as error:
+                self._image[key] = error
+            else:
+                self._image[key] = store_channels(pixels, channels, str(path))
+        image = self._image[key]
+        if isinstance(image, ValueError):
+            raise ValueError(str(image)) from image
+        return image
+
+
+def store_channels(image: np.ndarray, channels: tuple[int, ...], name: str) -> jax.Array:
+    """Some channels of a decoded image, on the device. They are copied only where the image has others too.
+
+    Args:
+        image: Pixels with 1 (gray), 2 (gray, alpha), 3 or 4 channels.
+        channels: Numbers of the channels: 0 to 2 for colors, which are equal in gray images, or 3 alone for alpha,
+            which is 1 in images without it.
+        name: Name of the image in error messages.
+
+    Raises:
+        MemoryError: The channels do not fit into memory.
+    """
+    height, width, count = image.shape
+    whole = channels == tuple(range(count))
+    require.memory(
+        f"{name}: {len(channels)} channels of {width} x {height} pixels (width x height)",
+        (2 if whole else 3) * 4 * height * width * len(channels),  # one of these is for the check of the texture
+        "free some memory, or reduce the size of the image in another program first",
+    )
+    if whole:
+        return jax.device_put(image)
+    if channels == (3,) and count % 2:
+        return jax.device_put(np.ones((height, width, 1), image.dtype))
+    place = (0, 0, 0, 1) if count < 3 else (0, 1, 2, 3)
+    return jax.device_put(np.take(image, [place[channel] for channel in channels], -1))
+
+
+def matte(*, geometry: Geometry | None = None) -> TexturedMaterial:
+    """The material of faces without one: a matte gray, or white where vertex colors multiply it."""
+    white = geometry is not None and geometry.color is not None
+    return TexturedMaterial(base_color=1.0 if white else _GRAY, metallic=0.0, specular=0.0)
+
+
+def materials_of_images(
+    content: MeshContent, plain: TexturedMaterial, path: pathlib.Path, *, outside: bool
+) -> tuple[list[TexturedMaterial], set[str]]:
+    """The material of each region, and what cannot be read.
+
+    Args:
+        content: What the file holds.
+        plain: The material of regions without an image.
+        path: The file, in whose folder the images are.
+        outside: Whether images outside of the folder are read.
+
+    Raises:
+        ValueError: An image is outside of the folder.
+    """
+    materials, ignored, pictures = [], set(content.ignored), TextureImages()
+    for name in content.images:
+        material = plain
+        if name is not None:
+            owner = f"{path}, TextureFile"
+            file = inputs.reference(name, path.parent, folder=path.parent, owner=owner, outside=outside)
+            try:
+                image = pictures.read(file, (0, 1, 2), decoded=True)
+                texture = Texture(image, np.eye(2, 3, dtype=np.float32))
+                material = TexturedMaterial(base_color=1.0, metallic=0.0, specular=0.0, base_color_texture=texture)
+            except FileNotFoundError:
+                ignored.add(f"TextureFile ({file}, which does not exist)")
+            except ValueError as error:
+                ignored.add(f"TextureFile ({error})")
+        materials.append(material)
+    return materials, ignored
+
+
+def with_base_color(geometry: Geometry, materials: Sequence[TexturedMaterial], plain: TexturedMaterial) -> Geometry:
+    """The geometry with a color for each vertex, if it has colors at all.
+
+    Vertices without color are gray where their region has no material, and have the color of the material elsewhere.
+    Where the base color is an image, vertex colors are left out: scanners write the colors of the image to both.
+
+    Args:
+        geometry: The geometry, with colors that are NaN where vertices have none.
+        materials: Material of each region.
+        plain: The material of regions that have none.
+    """
+    if geometry.color is None:
+        return geometry
+    region = np.zeros(len(geometry.position), int) if geometry.region is None else geometry.region
+    missing = np.array([_GRAY if material is plain else 1.0 for material in materials])[region]
+    textured = np.array([material.base_color_texture is not None for material in materials])[region]
+    color = np.where(np.isfinite(geometry.color), geometry.color, missing[:, None])
+    return geometry._replace(color=np.where(textured[:, None], 1, color))
 
 
 def split_parts(

@@ -1,4 +1,4 @@
-"""The container format of glTF 2.0: buffers, accessors and images, in GLB files or separate files.
+"""The container format of glTF 2.0: header, extensions, buffers, accessors and images, in GLB or separate files.
 
 References in comments are to sections of the glTF 2.0 specification, https://registry.khronos.org/glTF/specs/2.0.
 """
@@ -6,23 +6,318 @@ References in comments are to sections of the glTF 2.0 specification, https://re
 import base64
 import contextlib
 import functools
+import json
+import math
 import pathlib
 import re
 import struct
 import urllib.parse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxprt import require
 from jaxprt.files import inputs
-from jaxprt.scene.formats import gltf_meshopt
-from jaxprt.scene.formats.gltf_header import Header, excerpt
 
+_SLACK = 64  # bytes of compressed data besides which a header can be short
+_SHOWN = 80  # characters of a wrong value in messages
+_LARGEST = 2**53  # JSON numbers are exact up to here
+LARGEST_FLOAT = float(np.finfo(np.float32).max)
+MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
+_MODES = ("ATTRIBUTES", "TRIANGLES", "INDICES")
+_FILTERS = ("NONE", "OCTAHEDRAL", "QUATERNION", "EXPONENTIAL", "COLOR")
+_WIDEST_ELEMENT = 256  # bytes of an element
+# Decoded bytes of one compressed byte: the vertex codec packs 256 bytes of equal values into 2 bits.
+_MOST_DECODED = 1024
+DRACO = "KHR_draco_mesh_compression"
+INSTANCING = "EXT_mesh_gpu_instancing"
+# Compressed data are decoded where they have no uncompressed fallback.
+_COMPRESSION = {DRACO, *MESHOPT, "KHR_texture_basisu", "EXT_texture_webp"}
+HONORED = {
+    *(
+        f"KHR_materials_{name}"
+        for name in ("ior", "specular", "anisotropy", "emissive_strength", "clearcoat", "sheen", "transmission")
+    ),
+    "KHR_texture_transform",
+    "KHR_mesh_quantization",
+    INSTANCING,
+    "KHR_lights_punctual",
+    *_COMPRESSION,
+}
+# What jaxprt draws is right without these: the default variant, the finest level of detail, and no metadata.
+_HARMLESS = {"KHR_materials_variants", "MSFT_lod", "KHR_xmp", "KHR_xmp_json_ld"}
+_LOOK = "KHR_materials_"  # what a file looks like without these is named in a warning
+_NOT_GEOMETRY = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "EXT_lights_")
 _COMPONENT = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942  # types of GLB chunks
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")  # of a URI that is not relative
+
+
+class Header:
+    """The header of a glTF file. Errors name the file, the object and the field.
+
+    Only what is used is checked, so that damage elsewhere does no harm. Each list is checked once.
+
+    Attributes:
+        path: The file.
+        header: The JSON object.
+    """
+
+    def __init__(self, path: pathlib.Path, text: bytes):
+        """Parses the header.
+
+        Args:
+            path: The file.
+            text: The JSON text; a byte order mark is allowed.
+
+        Raises:
+            ValueError: The text is not JSON, holds a name twice in one object, or is not of version 2.
+        """
+        self.path = path
+        self._items: dict[str, list[dict[str, Any]]] = {}
+        self._decoded = 0  # bytes
+        try:
+            header = json.loads(text, object_pairs_hook=inputs.unique_names)  # section 2.6
+        except (ValueError, RecursionError) as error:
+            raise self.error("must be an undamaged glTF file", f"a header that is not JSON: {error}") from error
+        if not isinstance(header, dict):
+            raise self.error("must be an undamaged glTF file with an object as its header", excerpt(header))
+        self.header: dict[str, Any] = header
+        asset = self.object(header, "asset", "the file")
+        version = str(asset.get("version", "none"))
+        if not version.startswith("2."):
+            raise self.error("must be an undamaged glTF file of version 2", f"version {version[:_SHOWN]}")
+        least = str(asset.get("minVersion", "2.0"))
+        if least != "2.0":
+            raise self.error("must be a glTF file that needs no more than version 2.0", f"minVersion {least[:_SHOWN]}")
+
+    def error(self, required: str, got: str) -> ValueError:
+        """An error that names the file."""
+        return ValueError(f"{self.path} {required}, got {got}")
+
+    def items(self, kind: str) -> list[dict[str, Any]]:
+        """All objects of a kind, such as "meshes"; may be empty."""
+        if kind not in self._items:
+            items = self.header.get(kind, [])
+            must = f"must be an undamaged glTF file with a list of {kind}"
+            if not isinstance(items, list):
+                raise self.error(must, type(items).__name__)
+            for number, item in enumerate(items):
+                if not isinstance(item, dict):
+                    raise self.error(f"{must}, all of them objects", f"{excerpt(item)} at {number}")
+            self._items[kind] = items
+        return self._items[kind]
+
+    def change(self, kind: str, fields: Mapping[int, Mapping[str, Any]]) -> None:
+        """Replaces fields of some objects of a kind, which the header itself keeps.
+
+        Args:
+            kind: The kind, such as "nodes".
+            fields: New fields by the index of the object.
+        """
+        items = self.items(kind)
+        self._items[kind] = [{**item, **fields.get(number, {})} for number, item in enumerate(items)]
+
+    def index(self, kind: str, value: Any, owner: str) -> int:
+        """The index of an object of a kind.
+
+        Args:
+            kind: The kind, such as "meshes".
+            value: The index, read from the file and not checked yet.
+            owner: The object that refers to it, for error messages.
+
+        Raises:
+            ValueError: There is no object with this index.
+        """
+        count = len(self.items(kind))
+        if not _is_whole(value) or not 0 <= value < count:
+            raise self.error(f"must refer to one of its {count} {kind} in {owner}", excerpt(value))
+        return int(value)
+
+    def item(self, kind: str, value: Any, owner: str) -> dict[str, Any]:
+        """The object of a kind that has an index; arguments and errors are those of `index`."""
+        return self.items(kind)[self.index(kind, value, owner)]
+
+    def object(self, item: dict[str, Any], key: str, owner: str) -> dict[str, Any]:
+        """A field that is an object; empty if it is missing."""
+        return self._field(item, key, owner, dict, "an object", {})
+
+    def array(self, item: dict[str, Any], key: str, owner: str) -> list:
+        """A field that is a list; empty if it is missing."""
+        return self._field(item, key, owner, list, "a list", [])
+
+    def strings(self, item: dict[str, Any], key: str, owner: str) -> list[str]:
+        """A field that is a list of strings; empty if it is missing."""
+        values = self.array(item, key, owner)
+        for value in values:
+            if not isinstance(value, str):
+                raise self.error(f"must have a list of strings for {key} of {owner}", f"{excerpt(value)} in it")
+        return values
+
+    def string(self, item: dict[str, Any], key: str, owner: str) -> str:
+        """A field that is a string.
+
+        Raises:
+            ValueError: It is missing or of another type.
+        """
+        return self._field(item, key, owner, str, "a string", None)
+
+    def boolean(self, item: dict[str, Any], key: str, owner: str) -> bool:
+        """A field that is true or false; false if it is missing."""
+        return self._field(item, key, owner, bool, "true or false", False)
+
+    def integer(self, item: dict[str, Any], key: str, owner: str, default: int | None = None) -> int:
+        """A field that is a whole number and not negative.
+
+        Raises:
+            ValueError: It is of another type, negative, or beyond 2^53; or it is missing and there is no default.
+        """
+        value = self._present(item, key, owner) if default is None else item.get(key, default)
+        if not _is_whole(value) or not 0 <= value <= _LARGEST:
+            raise self.error(f"must have a whole number of at least 0 for {key} of {owner}", excerpt(value))
+        return int(value)
+
+    def numbers(self, value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
+        """Checks one number, or a list of numbers, and converts it to float64.
+
+        Raises:
+            ValueError: The numbers are of another type or count, or not finite in float32.
+        """
+        listed = value if shape else [value]
+        right = isinstance(listed, list | tuple) and len(listed) == math.prod(shape)
+        if not right or not all(type(number) in (int, float) and abs(number) <= LARGEST_FLOAT for number in listed):
+            must = f"{math.prod(shape)} finite numbers" if shape else "a finite number"
+            raise self.error(f"must have {must} for {what}", excerpt(value))
+        return np.array(value, np.float64)
+
+    def decoding(self, size: int, length: int, name: str, *, most: int) -> None:
+        """Refuses compressed data that would become larger than they can, or than memory. Counts what is decoded.
+
+        Args:
+            size: Bytes that the header states for the decoded data.
+            length: Bytes of the compressed data.
+            name: The compressed data, for messages.
+            most: Decoded bytes that one compressed byte can hold at most.
+        """
+        if size > most * (length + _SLACK):
+            raise self.error(f"must have at most {most} decoded bytes for each byte of {name}", f"{size} for {length}")
+        self._decoded += size
+        require.memory(f"the decoded data of {self.path}", self._decoded, "load a smaller scene")
+
+    def _field(self, item: dict[str, Any], key: str, owner: str, kind: type, name: str, default: Any) -> Any:
+        value = self._present(item, key, owner) if default is None else item.get(key, default)
+        if not isinstance(value, kind):
+            raise self.error(f"must have {name} for {key} of {owner}", excerpt(value))
+        return value
+
+    def _present(self, item: dict[str, Any], key: str, owner: str) -> Any:
+        if key not in item:
+            raise self.error("must be an undamaged glTF file", f"one that lacks {key!r} in {owner}")
+        return item[key]
+
+
+def excerpt(value: Any) -> str:
+    """A value of a header for an error message, cut where it is long."""
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+
+
+def _is_whole(value: Any) -> bool:
+    """Whether a JSON number is whole, as 3 and 3.0 are. Booleans are no numbers."""
+    return type(value) is int or (type(value) is float and value.is_integer())
+
+
+def meshopt_extension(header: Header, view: dict[str, Any], name: str) -> dict[str, Any] | None:
+    """The extension of a buffer view; None if it is not compressed."""
+    extensions = header.object(view, "extensions", name)
+    used = [key for key in MESHOPT if key in extensions]
+    return header.object(extensions, used[0], name) if used else None
+
+
+def is_fallback(header: Header, buffer: dict[str, Any], name: str) -> bool:
+    """Whether a buffer only stands in for compressed data and has no bytes."""
+    extensions = header.object(buffer, "extensions", name)
+    stated = any(header.object(extensions, key, name).get("fallback") is True for key in MESHOPT if key in extensions)
+    return stated and "uri" not in buffer
+
+
+def decode_meshopt(
+    document: Header, view: dict[str, Any], extension: dict[str, Any], content: memoryview, name: str
+) -> bytes:
+    """The bytes of a compressed buffer view.
+
+    Args:
+        document: The file.
+        view: The buffer view.
+        extension: Its extension.
+        content: The compressed bytes.
+        name: Name of the view, for messages.
+
+    Raises:
+        ImportError: The package meshopt is missing.
+        ValueError: The data are damaged, or their size differs from that of the view.
+        MemoryError: The decoded data do not fit into memory.
+    """
+    owner = f"{MESHOPT[0]} of {name}" if MESHOPT[0] in view["extensions"] else f"{MESHOPT[1]} of {name}"
+    count, stride = (document.integer(extension, key, owner) for key in ("count", "byteStride"))
+    mode, words = extension.get("mode"), extension.get("filter", "NONE")
+    if mode not in _MODES or words not in _FILTERS:
+        must = f"must have one of the modes {', '.join(_MODES)} and of the filters {', '.join(_FILTERS)} in {owner}"
+        raise document.error(must, f"{excerpt(mode)} and {excerpt(words)}")
+    right = 0 < stride <= _WIDEST_ELEMENT and stride % 4 == 0 if mode == "ATTRIBUTES" else stride in (2, 4)
+    if not right:
+        must = "multiples of 4 up to 256 bytes" if mode == "ATTRIBUTES" else "2 or 4 bytes"
+        raise document.error(f"must have elements of {must} in {owner}", f"{stride} bytes")
+    size = document.integer(view, "byteLength", name)
+    if count * stride != size:
+        got = f"{count} elements of {stride} bytes"
+        raise document.error(f"must have {size} decoded bytes in {owner}, as in the buffer view", got)
+    document.decoding(size, len(content), owner, most=_MOST_DECODED)
+    try:
+        import meshopt
+    except ImportError as error:
+        raise ImportError(
+            f"{document.path} has compressed geometry ({owner}), which needs the package meshopt: "
+            "pip install 'jaxprt[web]'"
+        ) from error
+    try:
+        return meshopt.decode_gltf_buffer(bytes(content), count, stride, mode, words).tobytes()
+    except (ValueError, RuntimeError) as error:
+        raise document.error(f"must have undamaged data of meshoptimizer in {owner}", str(error)) from error
+
+
+def unread_extensions(header: Header) -> set[str]:
+    """Names of the extensions that a file uses or requires, except those that are read.
+
+    Extensions of materials are left out: the reader of materials names those that a material of the scene has.
+    """
+    names = (
+        name
+        for key in ("extensionsUsed", "extensionsRequired")
+        for name in header.strings(header.header, key, "the file")
+    )
+    return {name for name in names if not name.startswith(_LOOK)} - HONORED
+
+
+def check_required(header: Header, *, geometry: bool) -> None:
+    """Refuses a file that requires extensions that are not read.
+
+    Args:
+        header: The file.
+        geometry: Whether only the geometry is read, so that extensions of materials, textures and lights do not matter.
+
+    Raises:
+        ValueError: The file requires other extensions. The message names them.
+    """
+    required = set(header.strings(header.header, "extensionsRequired", "the file"))
+    unknown = sorted(name for name in required - HONORED - _HARMLESS if not name.startswith(_LOOK))
+    if geometry:
+        unknown = [name for name in unknown if not name.startswith(_NOT_GEOMETRY)]
+    if unknown:
+        known = ", ".join(sorted(HONORED))
+        raise header.error(f"must not require extensions other than {known}", ", ".join(unknown))
 
 
 class Elements(NamedTuple):
@@ -192,14 +487,14 @@ class Document(Header):
     def _part(self, view: dict[str, Any], name: str) -> memoryview:
         """The bytes of a buffer view. Compressed views are decoded where they have no uncompressed fallback."""
         index = self.index("buffers", view.get("buffer"), name)
-        extension = gltf_meshopt.extension(self, view, name)
+        extension = meshopt_extension(self, view, name)
         if extension is None:
             return self._cut(view, name)
         here = "uri" in self.items("buffers")[index] or (index == 0 and self._chunk is not None)
-        if here and not gltf_meshopt.is_fallback(self, self.items("buffers")[index], f"buffer {index}"):
+        if here and not is_fallback(self, self.items("buffers")[index], f"buffer {index}"):
             return self._cut(view, name)
         content = self._cut(extension, f"the compressed data of {name}")
-        return memoryview(gltf_meshopt.decoded(self, view, extension, content, name))
+        return memoryview(decode_meshopt(self, view, extension, content, name))
 
     def _cut(self, item: dict[str, Any], name: str) -> memoryview:
         """The bytes of a buffer that an object names."""

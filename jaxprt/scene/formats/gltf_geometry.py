@@ -1,28 +1,372 @@
-"""Geometry of glTF files: the triangles of the meshes of all nodes, in world coordinates.
+"""Geometry of glTF files: the triangles of the meshes of all nodes, with skins and morph targets, in world coordinates.
 
 References in comments are to sections of the glTF 2.0 specification, https://registry.khronos.org/glTF/specs/2.0.
 """
 
+import struct
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxprt import require
-from jaxprt.scene.formats import gltf_morph, gltf_skin
-from jaxprt.scene.formats.geometry import Geometry, instances, joined
-from jaxprt.scene.formats.gltf_draco import DracoReader
-from jaxprt.scene.formats.gltf_extensions import check_required
-from jaxprt.scene.formats.gltf_file import Document, Elements
+from jaxprt.scene.formats.geometry import Geometry, cofactors, instances, joined
+from jaxprt.scene.formats.gltf_file import DRACO, Document, Elements, check_required, excerpt
 from jaxprt.scene.formats.gltf_nodes import Node, instance_count, joint_transforms, nodes
 from jaxprt.scene.formats.gltf_nodes import instances as instance_matrices
 
+# Attributes that targets change, and their numbers of components. The sign of a tangent stays (section 3.7.2.2).
+_MORPHS = {"POSITION": (3,), "NORMAL": (3,), "TANGENT": (3,), "COLOR_0": (3, 4)}
+_MORPHS |= {"TEXCOORD_0": (2,), "TEXCOORD_1": (2,)}
+_MESH, _SEQUENTIAL, _EDGEBREAKER = 1, 0, 1
+_METADATA = 0x8000  # flag of a header that metadata follow
+_DEEPEST = 16  # of metadata in metadata
+_CORNER = 16  # bytes of a decoded corner of a triangle and of a component of a vertex, with what the decoder keeps
+# Triangles of one compressed byte: entropy coding packs equal symbols of regular meshes without a limit in theory.
+_MOST_DECODED = 4096
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 # Attributes that are read, and their numbers of components.
 _ATTRIBUTES = {"POSITION": (3,), "NORMAL": (3,), "TANGENT": (4,), "COLOR_0": (3, 4)}
 _ATTRIBUTES |= {"TEXCOORD_0": (2,), "TEXCOORD_1": (2,)}
 # Bytes for each vertex, its joints, each triangle, and each primitive of a node, while a scene is loaded, as measured.
 _VERTEX, _JOINTS, _FACE, _PART = 300, 350, 70, 3000
+
+
+class Binding(NamedTuple):
+    """The joints of vertices.
+
+    Attributes:
+        joint: Numbers of joints in the skin [v k].
+        weight: Weights of the joints [v k].
+    """
+
+    joint: np.ndarray
+    weight: np.ndarray
+
+
+def skin_binding(
+    document: Document, attribute: dict[str, Elements], sets: int, used: np.ndarray, name: str
+) -> Binding | None:
+    """The joints of the used vertices of a primitive, from JOINTS_n and WEIGHTS_n (section 3.7.3.3).
+
+    Weights are scaled to a sum of 1. A vertex without weights follows its first joint.
+
+    Args:
+        document: The file.
+        attribute: Attributes of the primitive.
+        sets: Number of sets of joints; 0 gives None.
+        used: Indices of the used vertices.
+        name: Name of the primitive, for messages.
+
+    Raises:
+        ValueError: A weight is negative or not finite.
+    """
+    if not sets:
+        return None
+    joint = np.concatenate([attribute[f"JOINTS_{number}"].rows(used) for number in range(sets)], 1).astype(np.int64)
+    weight = np.concatenate([attribute[f"WEIGHTS_{number}"].numbers(used) for number in range(sets)], 1)
+    wrong = np.flatnonzero(~(np.isfinite(weight) & (weight >= 0)).all(1))
+    if wrong.size:
+        got = f"{len(wrong)} of {len(weight)} vertices without, the first has {weight[wrong[0]].tolist()}"
+        raise document.error(f"must have weights of joints of at least 0 in {name}", got)
+    total = weight.sum(1, keepdims=True)
+    first = np.eye(1, weight.shape[1])
+    return Binding(joint, np.where(total > 0, weight / np.where(total > 0, total, 1), first))
+
+
+def skin_joints(document: Document, skin: int) -> list[int]:
+    """Indices of the nodes that are the joints of a skin.
+
+    Raises:
+        ValueError: A joint is missing, or there are none.
+    """
+    item, owner = document.items("skins")[skin], f"skin {skin}"
+    named = [document.index("nodes", joint, owner) for joint in document.array(item, "joints", owner)]
+    if not named:
+        raise document.error(f"must have one or more joints in {owner}", "none")
+    return named
+
+
+def joint_matrices(document: Document, skin: int, world: dict[int, np.ndarray]) -> np.ndarray:
+    """Transforms from the space of a mesh to world coordinates, one for each joint of a skin [j 4 4] (section 3.7.3).
+
+    Args:
+        document: The file.
+        skin: Index of the skin.
+        world: World transforms of nodes by their indices.
+
+    Raises:
+        ValueError: A joint is missing, or there are fewer inverse bind matrices than joints.
+    """
+    item, owner, named = document.items("skins")[skin], f"skin {skin}", skin_joints(document, skin)
+    for joint in named:
+        if joint not in world:
+            raise document.error(f"must have joints of {owner} that belong to trees of nodes", f"node {joint}")
+    matrix = np.array([world[joint] for joint in named])
+    if "inverseBindMatrices" not in item:
+        return matrix
+    inverse = document.accessor(item["inverseBindMatrices"], f"inverseBindMatrices of {owner}", 16)
+    if len(inverse.value) < len(named):
+        must = f"must have an inverse bind matrix for each of the {len(named)} joints of {owner}"
+        raise document.error(must, str(len(inverse.value)))
+    columns = inverse.numbers(slice(len(named))).reshape(-1, 4, 4)
+    if not np.isfinite(columns).all():
+        raise document.error(f"must have finite inverse bind matrices in {owner}", "others")
+    with np.errstate(over="ignore", invalid="ignore"):  # meshes refuse positions that are not finite
+        return matrix @ columns.transpose(0, 2, 1)
+
+
+def apply_skin(document: Document, geometry: Geometry, bound: Binding, matrices: np.ndarray, name: str) -> Geometry:
+    """A geometry in world coordinates, each vertex moved by the weighted mean of the transforms of its joints.
+
+    Normals are transformed by the cofactors of this mean. Where it mirrors, faces are flipped.
+
+    Args:
+        document: The file.
+        geometry: The geometry in the space of its mesh.
+        bound: The joints of its vertices.
+        matrices: Transforms of the joints [j 4 4].
+        name: Name of the primitive, for messages.
+
+    Raises:
+        ValueError: A vertex refers to a joint that the skin does not have.
+    """
+    joint, weight = bound
+    far = np.flatnonzero(((joint >= len(matrices)) & (weight > 0)).any(1))
+    if far.size:
+        got = f"{len(far)} of {len(joint)} vertices that refer to others, the first to {joint[far[0]].tolist()}"
+        raise document.error(f"must refer to joints 0 to {len(matrices) - 1} in {name}", got)
+    joint = np.minimum(joint, len(matrices) - 1)
+    with np.errstate(over="ignore", invalid="ignore"):  # meshes refuse positions that are not finite
+        mean = np.zeros((len(joint), 3, 4))
+        for column in range(joint.shape[1]):
+            mean += weight[:, column, None, None] * matrices[joint[:, column], :3]
+        linear = mean[:, :, :3]
+        cofactor = cofactors(linear)
+        side = np.where((linear[:, 0] * cofactor[:, 0]).sum(1) < 0, -1.0, 1.0)
+        turned = geometry._replace(position=_transform(linear, geometry.position) + mean[:, :, 3])
+        if geometry.normal is not None:
+            turned = turned._replace(normal=_transform(cofactor, geometry.normal) * side[:, None])
+        if geometry.tangent is not None:
+            plain = np.ones(len(joint)) if geometry.handedness is None else geometry.handedness
+            turned = turned._replace(tangent=_transform(linear, geometry.tangent), handedness=plain * side)
+    face = geometry.face
+    mirrored = side[face].sum(1, keepdims=True) < 0
+    return turned._replace(face=np.where(mirrored, face[:, ::-1], face))
+
+
+def _transform(linear: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Each vector [v 3] transformed by the linear map of its vertex [v 3 3]."""
+    return np.einsum("vij,vj->vi", linear, vector)
+
+
+def morph_weights(document: Document, node: Node, mesh: int, count: int) -> tuple[float, ...]:
+    """The weights of the morph targets of a node's mesh: those of the node, or else of the mesh, or else 0.
+
+    Args:
+        document: The file.
+        node: The node.
+        mesh: Index of its mesh.
+        count: Number of targets of the mesh.
+
+    Raises:
+        ValueError: There are more or fewer weights than targets, or they are not finite.
+    """
+    if not count:
+        return ()
+    for item, owner in ((node.item, f"node {node.number}"), (document.items("meshes")[mesh], f"mesh {mesh}")):
+        if "weights" in item:
+            what = f"the weights of {owner}, one for each morph target of mesh {mesh}"
+            return tuple(document.numbers(item["weights"], (count,), what).tolist())
+    return (0.0,) * count
+
+
+def morph_change(
+    document: Document,
+    targets: Sequence[Any],
+    weight: Sequence[float],
+    *,
+    key: str,
+    used: np.ndarray,
+    count: int,
+    name: str,
+) -> np.ndarray | float:
+    """What the morph targets of a primitive add to one attribute of some vertices. Targets of weight 0 are not read.
+
+    Args:
+        document: The file.
+        targets: The targets, as they stand in the file; may be empty.
+        weight: Weights of the targets.
+        key: Name of the attribute.
+        used: Indices of the vertices.
+        count: Number of vertices of the primitive.
+        name: Name of the primitive, for messages.
+
+    Raises:
+        ValueError: The primitive has another number of targets, or a target has other vertices or is not finite.
+    """
+    if not targets:
+        return 0.0
+    if len(targets) != len(weight):
+        raise document.error(f"must have {len(weight)} morph targets in {name}, as in its mesh", str(len(targets)))
+    total: np.ndarray | float = 0.0
+    for number, (target, share) in enumerate(zip(targets, weight, strict=True)):
+        owner = f"morph target {number} of {name}"
+        if not isinstance(target, dict):
+            raise document.error(f"must have an object for {owner}", excerpt(target))
+        if not share or key not in target:
+            continue
+        elements = document.accessor(target[key], f"{key} of {owner}", *_MORPHS[key])
+        if len(elements.value) != count:
+            got = str(len(elements.value))
+            raise document.error(f"must have {count} elements in {key} of {owner}, as in POSITION", got)
+        difference = elements.numbers(used)
+        if not np.isfinite(difference).all():
+            wrong = np.flatnonzero(~np.isfinite(difference).all(1))
+            got = f"{len(wrong)} of {len(used)} that are not, the first at vertex {used[wrong[0]]}"
+            raise document.error(f"must have finite numbers in {key} of {owner}", got)
+        total = total + share * difference
+    return total
+
+
+class DracoReader:
+    """Decodes the compressed primitives of a file. Primitives that share a buffer view are decoded once."""
+
+    def __init__(self, document: Document):
+        self._document = document
+        self._mesh: dict[int, Any] = {}
+
+    def primitive(self, item: dict[str, Any], name: str) -> dict[str, Elements] | None:
+        """The compressed attributes of a primitive, and its "indices"; None if all its accessors have data.
+
+        Args:
+            item: The primitive.
+            name: Name of the primitive, for messages.
+
+        Raises:
+            ImportError: The package DracoPy is missing.
+            ValueError: The data are damaged, or have other counts than the accessors of the primitive.
+            MemoryError: The decoded data do not fit into memory.
+        """
+        document = self._document
+        extensions = document.object(item, "extensions", name)
+        if DRACO not in extensions:
+            return None
+        attribute = document.object(item, "attributes", name)
+        accessors = [*attribute.values(), *([item["indices"]] if "indices" in item else [])]
+        if all("bufferView" in document.item("accessors", value, name) for value in accessors):
+            return None
+        owner = f"{DRACO} of {name}"
+        extension = document.object(extensions, DRACO, name)
+        numbers = document.object(extension, "attributes", owner)
+        if "POSITION" not in numbers or "indices" not in item or "POSITION" not in attribute:
+            raise document.error(f"must have POSITION and indices in {owner}", f"{sorted(numbers)}")
+        corners = document.form(item["indices"], f"indices of {name}", 1, whole=True)
+        vertices = document.form(attribute["POSITION"], f"POSITION of {name}", 3)
+        mesh = self._decoded(extension, owner, corners.rows, vertices.rows)
+        face = np.asarray(mesh.faces)
+        if face.size != corners.rows:
+            raise document.error(f"must have {corners.rows} corners of triangles in {owner}", str(face.size))
+        by_number = {one["unique_id"]: one["data"] for one in mesh.attributes}
+        result = {"indices": Elements(face.reshape(-1, 1), np.zeros(0, np.int64), face[:0], 0)}
+        for key, number in numbers.items():
+            if key not in attribute:
+                continue
+            form = document.form(attribute[key], f"{key} of {name}", 1, 2, 3, 4)
+            value = by_number.get(number) if type(number) is int else None
+            if value is None or value.shape != (form.rows, form.width):
+                got = "none" if value is None else f"{value.shape[0]} of {value.shape[1]}"
+                raise document.error(f"must have {form.rows} elements of {form.width} in {key} of {owner}", got)
+            value = np.asarray(value).astype(form.dtype)
+            result[key] = Elements(value, np.zeros(0, np.int64), value[:0], form.most)
+        return result
+
+    def _decoded(self, extension: dict[str, Any], owner: str, corners: int, vertices: int) -> Any:
+        """The decoded mesh of a buffer view, whose header must state as many triangles as the primitive has."""
+        document = self._document
+        index = document.index("bufferViews", extension.get("bufferView"), owner)
+        if index in self._mesh:
+            return self._mesh[index]
+        content = bytes(document.view(index, owner)[0])
+        size = _CORNER * (corners + vertices * len(extension["attributes"]))
+        document.decoding(size, len(content), owner, most=_MOST_DECODED * _CORNER)
+        try:
+            import DracoPy
+        except ImportError as error:
+            raise ImportError(
+                f"{document.path} has compressed geometry ({owner}), which needs the package DracoPy: "
+                "pip install 'jaxprt[web]'"
+            ) from error
+        must = f"must have an undamaged mesh of Draco in {owner}"
+        try:
+            faces, points = mesh_counts(content)
+        except (ValueError, IndexError, struct.error) as error:
+            raise document.error(must, str(error) or "other data") from error
+        if 3 * faces != corners or points > vertices:
+            got = f"{faces} triangles and {points} vertices in the header of the compressed data"
+            raise document.error(f"must have {corners // 3} triangles and {vertices} vertices in {owner}", got)
+        try:
+            mesh = DracoPy.decode(content)
+        except (DracoPy.FileTypeException, ValueError, RuntimeError, MemoryError) as error:
+            raise document.error(must, f"{type(error).__name__}: {error}") from error
+        self._mesh[index] = mesh
+        return mesh
+
+
+def mesh_counts(content: bytes) -> tuple[int, int]:
+    """The numbers of triangles and of vertices that the header of a Draco mesh states.
+
+    Vertices on seams count once, so that a mesh may have more than the header states. The decoder allocates memory by
+    these numbers before it can find out that the data are shorter.
+
+    Raises:
+        ValueError: It is not a mesh of version 2.2.
+        IndexError: The data end too early.
+
+    Reference: Draco bitstream specification, sections 3 and 4.
+    """
+    magic, major, minor, kind, method, flags = struct.unpack_from("<5s4BH", content)
+    if (magic, major, minor, kind) != (b"DRACO", 2, 2, _MESH) or method not in (_SEQUENTIAL, _EDGEBREAKER):
+        raise ValueError(f"data that start {content[:10]!r}")
+    place = 11
+    if flags & _METADATA:
+        count, place = _varint(content, place)
+        for _ in range(count):
+            _, place = _varint(content, place)
+            place = _after_metadata(content, place, 0)
+        place = _after_metadata(content, place, 0)
+    if method == _SEQUENTIAL:
+        faces, place = _varint(content, place)
+        return faces, _varint(content, place)[0]
+    points, place = _varint(content, place + 1)  # after the kind of the traversal
+    return _varint(content, place)[0], points
+
+
+def _varint(content: bytes, place: int) -> tuple[int, int]:
+    """A number of seven bits in each byte, lowest first, and the place after it."""
+    value = shift = 0
+    while content[place] & 128:
+        value |= (content[place] & 127) << shift
+        place, shift = place + 1, shift + 7
+        if shift > 28:
+            raise ValueError("a number of more than 32 bits")
+    return value | content[place] << shift, place + 1
+
+
+def _after_metadata(content: bytes, place: int, depth: int) -> int:
+    """The place after a tree of metadata."""
+    if depth > _DEEPEST:
+        raise ValueError("metadata that are nested too deeply")
+    count, place = _varint(content, place)
+    for _ in range(count):
+        place += 1 + content[place]
+        size, place = _varint(content, place)
+        place += size
+    count, place = _varint(content, place)
+    for _ in range(count):
+        place += 1 + content[place]
+        place = _after_metadata(content, place, depth + 1)
+    return place
 
 
 class Primitive(NamedTuple):
@@ -230,7 +574,7 @@ def _placements(
     matrices = [instance_matrices(document, node) for node in drawn]
     most = {mesh: max(len(primitive.targets) for primitive in listed) for mesh, listed in primitives.items() if listed}
     shapes = [
-        (mesh, gltf_morph.weights(document, node, mesh, most[mesh])) for node, mesh in zip(drawn, mesh_of, strict=True)
+        (mesh, morph_weights(document, node, mesh, most[mesh])) for node, mesh in zip(drawn, mesh_of, strict=True)
     ]
     together: dict[tuple, list[np.ndarray]] = {}
     for shape, matrix in zip(shapes, matrices, strict=True):
@@ -240,19 +584,19 @@ def _placements(
         pairs = [_geometry(document, primitive, shape[1]) for primitive in primitives[shape[0]]]
         bound[shape] = pairs
         placed[shape] = [iter(instances(geometry, np.concatenate(transforms))) for geometry, _ in pairs]
-    skins = _joint_matrices(document, scene, drawn, mesh_of, primitives)
+    skins = _skins(document, scene, drawn, mesh_of, primitives)
     for node, shape, matrix in zip(drawn, shapes, matrices, strict=True):
         skin, listed = skins.get(node.number), primitives[shape[0]]
         for _ in matrix:
             for primitive, (geometry, binding), rest in zip(listed, bound[shape], placed[shape], strict=True):
                 here = next(rest)
                 if skin is not None and binding is not None:
-                    here = gltf_skin.pose(document, geometry, binding, skin, primitive.name)
+                    here = apply_skin(document, geometry, binding, skin, primitive.name)
                     here = here._replace(normal=_face_normals(here.position[here.face])) if primitive.flat else here
                 yield node, primitive, here
 
 
-def _joint_matrices(
+def _skins(
     document: Document,
     scene: Sequence[Node],
     drawn: Sequence[Node],
@@ -267,15 +611,13 @@ def _joint_matrices(
     }
     if not skin:
         return {}
-    named = [joint for number in set(skin.values()) for joint in gltf_skin.joints(document, number)]
+    named = [joint for number in set(skin.values()) for joint in skin_joints(document, number)]
     world = joint_transforms(document, scene, named)
-    matrices = {number: gltf_skin.joint_matrices(document, number, world) for number in set(skin.values())}
+    matrices = {number: joint_matrices(document, number, world) for number in set(skin.values())}
     return {node: matrices[number] for node, number in skin.items()}
 
 
-def _geometry(
-    document: Document, primitive: Primitive, weight: tuple[float, ...]
-) -> tuple[Geometry, gltf_skin.Binding | None]:
+def _geometry(document: Document, primitive: Primitive, weight: tuple[float, ...]) -> tuple[Geometry, Binding | None]:
     """The triangles of a primitive (section 3.7.2), and the joints of its vertices.
 
     Args:
@@ -295,7 +637,7 @@ def _geometry(
         if key not in primitive.attribute:
             return None
         value, targets = primitive.attribute[key].numbers(used), primitive.targets
-        change = gltf_morph.change(document, targets, weight, key=key, used=used, count=count, name=primitive.name)
+        change = morph_change(document, targets, weight, key=key, used=used, count=count, name=primitive.name)
         if isinstance(change, np.ndarray):
             width = min(value.shape[1], change.shape[1])
             value[:, :width] += change[:, :width]
@@ -322,7 +664,7 @@ def _geometry(
         None if color is None else np.clip(np.nan_to_num(color[:, :3]), 0, 1),
         alpha=None if color is None or color.shape[1] < 4 else np.clip(np.nan_to_num(color[:, 3], nan=1.0), 0, 1),
     )
-    bound = gltf_skin.binding(document, primitive.attribute, primitive.joints, used, primitive.name)
+    bound = skin_binding(document, primitive.attribute, primitive.joints, used, primitive.name)
     return geometry, bound
 
 

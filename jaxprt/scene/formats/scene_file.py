@@ -1,4 +1,4 @@
-"""Loading of scenes from files of all supported formats."""
+"""Loading of meshes and scenes from files of all supported formats."""
 
 import pathlib
 import warnings
@@ -6,9 +6,46 @@ from collections.abc import Mapping
 from typing import Any
 
 from jaxprt import require
-from jaxprt.scene.formats import gltf, mesh_colors, mesh_file, mitsuba_dict, mtl
+from jaxprt.scene.formats import file_parts, gltf, mesh_file, mitsuba_dict, obj
 from jaxprt.scene.formats.file_parts import split_parts
+from jaxprt.scene.mesh import Mesh, from_file
 from jaxprt.scene.scene import Scene
+
+
+def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
+    """Loads a mesh from a PLY, OBJ, STL, OFF, GLB or glTF file. `load_scene` also reads materials and images.
+
+    Positions are read in double precision. If the mesh is far from zero, they become relative to `Mesh.origin` before
+    they are rounded to float32. Vertices and faces keep the order of the file, and no vertices are merged. Polygons are
+    divided into triangles of the same orientation: convex ones into fans, concave ones by ear clipping. A vertex is
+    split where its corners differ in what the file states for corners or faces: normals or texture coordinates. All
+    meshes of a glTF file's default scene are transformed by their nodes and joined, and its tangents are kept. Its
+    buffers must be in its folder; `load_scene` can read others. Texture coordinates are 0 where only some faces of the
+    file have them or they are not finite. OBJ faces that refer to texture coordinates or normals that do not exist are
+    loaded without them, with a warning. Triangle strips of PLY files become triangles.
+
+    Normals come from the file. Where they are absent, zero or NaN, they are means of the adjacent face normals,
+    weighted by angle. Vertices split at a seam share such a mean unless they form a crease of more than about 80
+    degrees. STL files have no shared vertices, so their vertices get the flat normals of their faces. So do primitives
+    of glTF files without normals, whose triangles get vertices of their own, as the specification says.
+
+    Args:
+        path: The file.
+        groups: Whether regions are the objects and groups of an OBJ file or the nodes of a glTF file, instead of
+            materials.
+
+    Returns:
+        The mesh. The regions of an OBJ file are numbered by first appearance, and so are those of a PLY file, which are
+        its images. Those of a glTF file are in the order of its materials, with parts without material last, or with
+        `groups` in the order of its nodes.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        ValueError: The file is of an unknown kind, damaged or empty, has positions that are not finite, or faces that
+            refer to missing vertices. An OBJ file truncated between two faces cannot be detected.
+    """
+    path = pathlib.Path(path)
+    return from_file(mesh_file.read(path, groups=groups), path)
 
 
 def _path(value: Any) -> None:
@@ -60,7 +97,7 @@ def load_scene(
     metal.
 
     Of an OBJ file, this reads the materials of its MTL files: Kd, Ks, Ns, Ke, map_Kd, map_Ke, norm, and the
-    metallic-roughness statements Pr, Pm, map_Pr, map_Pm and Ni. `mtl.read` explains how Phong materials and those of
+    metallic-roughness statements Pr, Pm, map_Pr, map_Pm and Ni. `obj.read_mtl` explains how Phong materials and those of
     Blender are converted. A single warning names missing MTL files, materials and images and unsupported statements.
 
     Files of other formats, and OBJ files without materials, become one matte gray part that is named after the file.
@@ -71,7 +108,7 @@ def load_scene(
 
     A dictionary has the form of `mitsuba.load_dict`. Transforms are arrays [4 4] or objects with a `matrix`. Supported
     are the shapes obj, ply, rectangle, cube and sphere (the last three are finely subdivided); the BSDFs that
-    `mitsuba_material` lists, nested or by `ref`, with bitmaps; area emitters; envmap and constant; and perspective
+    `mitsuba_dict` lists, nested or by `ref`, with bitmaps; area emitters; envmap and constant; and perspective
     sensors.
 
     A scene file from a stranger must not read other files of the user. What it refers to (buffers, images, MTL files)
@@ -115,14 +152,14 @@ def load_scene(
         raise ValueError(f"{path} must be a glTF file where a time is given, got {path.suffix.lower()!r}")
     mesh_file.check(path)
     content = mesh_file.content(path, groups=False)
-    plain = mesh_colors.matte(geometry=content.geometry)
+    plain = file_parts.matte(geometry=content.geometry)
     if path.suffix.lower() == ".obj":
-        names, materials = mtl.of_regions(path, plain, outside=outside)
+        names, materials = obj.materials_of_regions(path, plain, outside=outside)
         if names == ["default"]:
             names = [path.stem]
     else:
-        materials, ignored = mesh_colors.of_images(content, plain, path, outside=outside)
+        materials, ignored = file_parts.materials_of_images(content, plain, path, outside=outside)
         names = [path.stem] * len(materials)
         if ignored:
             warnings.warn(f"{path}: not supported and ignored are {', '.join(sorted(ignored))}", stacklevel=2)
-    return Scene(split_parts(mesh_colors.with_base_color(content.geometry, materials, plain), names, materials, path))
+    return Scene(split_parts(file_parts.with_base_color(content.geometry, materials, plain), names, materials, path))

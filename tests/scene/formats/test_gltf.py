@@ -14,9 +14,9 @@ import trimesh
 from jaxprt import require
 from jaxprt.files import images, write_png
 from jaxprt.scene import load_mesh, load_scene
+from jaxprt.scene.formats.file_parts import store_channels
+from jaxprt.scene.formats.gltf import MaterialReader
 from jaxprt.scene.formats.gltf_file import Document
-from jaxprt.scene.formats.gltf_material import MaterialReader
-from jaxprt.scene.formats.texture_images import stored
 from jaxprt.scene.mesh import split
 from tests.scene.formats.gltf_writer import FACE, KIND, PLACE, SQUARE, Writer, one
 
@@ -293,9 +293,9 @@ def test_channels_of_an_image_are_decoded_once_and_images_of_other_materials_are
 )
 def test_channels_of_gray_images_are_equal_and_missing_alpha_is_one(count, colors, alpha):
     image = np.tile(np.arange(1, count + 1, dtype=np.float32) / 10, (2, 3, 1))
-    np.testing.assert_allclose(stored(image, (0, 1, 2), "image"), np.tile(colors, (2, 3, 1)), rtol=1e-6)
-    np.testing.assert_allclose(stored(image, (1,), "image"), np.full((2, 3, 1), colors[1]), rtol=1e-6)
-    np.testing.assert_allclose(stored(image, (3,), "image"), np.full((2, 3, 1), alpha), rtol=1e-6)
+    np.testing.assert_allclose(store_channels(image, (0, 1, 2), "image"), np.tile(colors, (2, 3, 1)), rtol=1e-6)
+    np.testing.assert_allclose(store_channels(image, (1,), "image"), np.full((2, 3, 1), colors[1]), rtol=1e-6)
+    np.testing.assert_allclose(store_channels(image, (3,), "image"), np.full((2, 3, 1), alpha), rtol=1e-6)
 
 
 def test_texture_transforms_move_either_set_of_coordinates_as_blender_does(tmp_path, close):

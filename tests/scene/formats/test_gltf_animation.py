@@ -10,7 +10,7 @@ import scipy.interpolate
 import scipy.spatial
 
 from jaxprt.scene import load_scene
-from jaxprt.scene.formats import gltf_animation
+from jaxprt.scene.formats import gltf_nodes
 from tests.scene.formats.gltf_writer import PLACE, SQUARE, Writer, one
 
 POSES = json.loads((pathlib.Path(__file__).parent / "peers/three_poses.json").read_text())
@@ -82,12 +82,12 @@ def test_interpolation_is_that_of_scipy():
     rotations = scipy.spatial.transform.Rotation.from_quat([start, end])
     for along in (0.0, 0.2, 0.9, 1.0):
         np.testing.assert_allclose(
-            gltf_animation._hermite([*before], [*after], 0.7, along), spline(0.7 * along), atol=1e-12
+            gltf_nodes._hermite([*before], [*after], 0.7, along), spline(0.7 * along), atol=1e-12
         )
         turn = scipy.spatial.transform.Slerp([0, 1], rotations)(along).as_quat()
-        ours = gltf_animation.slerp(start, end, along)
+        ours = gltf_nodes.slerp(start, end, along)
         np.testing.assert_allclose(ours * np.sign(ours @ turn), turn, atol=1e-12)
-    np.testing.assert_allclose(gltf_animation.slerp(start, 2 * start, 0.3), start / np.linalg.norm(start), atol=1e-12)
+    np.testing.assert_allclose(gltf_nodes.slerp(start, 2 * start, 0.3), start / np.linalg.norm(start), atol=1e-12)
 
 
 def test_times_outside_of_the_keys_show_the_ends_and_one_key_is_enough(tmp_path):

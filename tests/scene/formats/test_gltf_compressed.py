@@ -13,7 +13,7 @@ import pytest
 from jaxprt import require
 from jaxprt.files import images, read_image
 from jaxprt.scene import load_mesh, load_scene
-from jaxprt.scene.formats.gltf_draco import stated_counts
+from jaxprt.scene.formats.gltf_geometry import mesh_counts
 from tests.scene.formats.gltf_writer import FACE, PLACE, SQUARE, Writer, one
 
 DRACO, MESHOPT = "KHR_draco_mesh_compression", "KHR_meshopt_compression"
@@ -140,7 +140,7 @@ def test_counts_stand_in_the_header_of_draco_data_after_metadata():
     ):
         content = DracoPy.encode(position, face, **options)
         mesh = DracoPy.decode(content)
-        assert stated_counts(content) == (len(mesh.faces), len(mesh.points)), options
+        assert mesh_counts(content) == (len(mesh.faces), len(mesh.points)), options
     assert struct.unpack_from("<H", content, 9)[0] & 0x8000
 
 

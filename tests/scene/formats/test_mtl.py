@@ -189,7 +189,7 @@ def test_comments_end_names_only_where_their_sign_stands_alone(tmp_path):
     write_png(tmp_path / "c#1.png", IMAGE)
     materials = "newmtl M_#1 # first\nKd 1 0 0 # red\nmap_Kd c#1.png # four colors\nnewmtl M_#2 #\nKd 0 1 0#green\n"
     path = write(tmp_path, materials, f"usemtl M_#1 # first\n{FACE}usemtl M_#2\n{FACE}usemtl M_#1\n{FACE}")
-    path.write_text(path.read_text().replace("scene.formats.mtl", "scene.mtl # materials"))
+    path.write_text(path.read_text().replace("scene.mtl", "scene.mtl # materials"))
     first, second = load_scene(path).parts  # Without a warning of anything missing.
     assert (first.name, second.name) == ("M_#1", "M_#2")
     assert (len(first.mesh.face), len(second.mesh.face)) == (4, 2)

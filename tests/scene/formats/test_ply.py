@@ -12,7 +12,7 @@ import pytest
 from jaxprt import require
 from jaxprt.files import write_png
 from jaxprt.scene import load_mesh, load_scene
-from jaxprt.scene.formats import mesh_file, ply_table
+from jaxprt.scene.formats import mesh_file, ply
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 XYZ = "property float x\nproperty float y\nproperty float z\n"
@@ -88,11 +88,11 @@ def test_lists_of_different_lengths_are_the_same_in_blocks_of_any_size(tmp_path,
     faces = [([7] * (row % 4), [row] * count, row / 2, [row / 4] * (2 * count)) for row, count in enumerate(lengths)]
     path = write(tmp_path, [("vertex", XYZ, [[0, 0, 0]] * 9), ("face", properties, faces)], form)
     content = path.read_bytes()
-    header = ply_table.read_header(content)
-    monkeypatch.setattr(ply_table, "_BLOCK", 4)
+    header = ply.read_header(content)
+    monkeypatch.setattr(ply, "_BLOCK", 4)
     for most in (1, 40, 10_000):
-        monkeypatch.setattr(ply_table, "_BYTES", most)
-        face = ply_table.read_elements(content, header, {"face"}, {"vertex_indices", "texcoord"})["face"]
+        monkeypatch.setattr(ply, "_BYTES", most)
+        face = ply.read_elements(content, header, {"face"}, {"vertex_indices", "texcoord"})["face"]
         np.testing.assert_array_equal(face["weight"], np.arange(9) / 2)
         np.testing.assert_array_equal(face["junk"].length, np.arange(9) % 4)
         assert not len(face["junk"].value)
@@ -124,10 +124,10 @@ def test_long_lists_that_nothing_uses_take_no_memory_and_others_count_before_the
 def test_the_work_for_a_header_is_in_proportion_to_its_elements():
     header = "ply\nformat ascii 1.0\n" + "".join(f"element kind{number} 0\n" for number in range(20_000))
     start = time.process_time()
-    assert len(ply_table.read_header(f"{header}end_header\n".encode()).elements) == 20_000
+    assert len(ply.read_header(f"{header}end_header\n".encode()).elements) == 20_000
     assert time.process_time() - start < 2  # 8 s if each name is compared with all others
     with pytest.raises(ValueError, match="its header must have one element 'kind7' with 0 or more rows"):
-        ply_table.read_header(f"{header}element kind7 0\nend_header\n".encode())
+        ply.read_header(f"{header}element kind7 0\nend_header\n".encode())
 
 
 @pytest.mark.parametrize("form", FORMATS)
@@ -397,7 +397,9 @@ def test_vertex_colors_of_a_ply_do_not_change_the_material_that_a_mitsuba_dictio
 
 
 def test_a_float_a_hair_above_one_is_white_and_not_a_byte():
-    from jaxprt.scene.formats.colors import linear
+    from jaxprt.scene.formats.geometry import linear_color
 
-    np.testing.assert_allclose(linear(np.array([[1.0000001, 1, 0], [0.5, 0.5, 0]]))[:, 0], [1, 0.21404], rtol=1e-4)
-    np.testing.assert_allclose(linear(np.array([[255.0, 0, 0], [127.5, 0, 0]]))[:, 0], [1, 0.21404], rtol=1e-4)
+    np.testing.assert_allclose(
+        linear_color(np.array([[1.0000001, 1, 0], [0.5, 0.5, 0]]))[:, 0], [1, 0.21404], rtol=1e-4
+    )
+    np.testing.assert_allclose(linear_color(np.array([[255.0, 0, 0], [127.5, 0, 0]]))[:, 0], [1, 0.21404], rtol=1e-4)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from jaxprt.scene import load_mesh
-from jaxprt.scene.formats import polygons
-from jaxprt.scene.formats.polygons import Polygons
+from jaxprt.scene.formats import geometry
+from jaxprt.scene.formats.geometry import Polygons
 
 L_SHAPE = np.array([[0.0, 0, 0], [2, 0, 0], [2, 0, -1], [1, 0, -1], [1, 0, -2], [0, 0, -2]])  # area 3, front +y
 DART = np.array([[0.0, 0, 0], [2, 0, -1], [0, 0, -2], [1, 0, -1]])  # area 1, concave at the last corner
@@ -24,7 +24,7 @@ def vector_area(polygon):
 
 
 def divided(polygon):
-    return polygons.triangulate(polygon, polygons.of_rows(np.arange(len(polygon))[None]), "file").corner
+    return geometry.triangulate(polygon, geometry.polygons_of_rows(np.arange(len(polygon))[None]), "file").corner
 
 
 def star(rng, corners):
@@ -131,7 +131,7 @@ def test_large_simple_polygons_keep_their_area(corners):
 
 @pytest.mark.parametrize("knot", [1, 4, 16])
 def test_large_polygons_that_cross_themselves_stay_fans_at_once_with_a_warning(monkeypatch, knot):
-    monkeypatch.setattr(polygons.mapbox_earcut, "triangulate_float64", lambda *_: pytest.fail("hangs"))
+    monkeypatch.setattr(geometry.mapbox_earcut, "triangulate_float64", lambda *_: pytest.fail("hangs"))
     corners = 48_000
     angle = np.linspace(0, 2 * np.pi, corners, endpoint=False)
     polygon = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1) * np.where(np.arange(corners) % 2, 1, 0.9)[:, None]
@@ -151,7 +151,7 @@ def test_polygons_of_different_sizes_stay_in_order():
     shapes = [star(rng, size) for size in (3, 6, 4, 3, 9, 5, 6)]
     size = np.array([len(shape) for shape in shapes])
     position = np.concatenate(shapes)
-    triangle, polygon = polygons.triangulate(position, Polygons(np.arange(len(position)), size), "file")
+    triangle, polygon = geometry.triangulate(position, Polygons(np.arange(len(position)), size), "file")
     np.testing.assert_array_equal(polygon, np.repeat(np.arange(7), size - 2))
     area = triangle_areas(position, triangle)
     for index, shape in enumerate(shapes):
