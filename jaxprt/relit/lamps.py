@@ -20,7 +20,7 @@ from jaxprt.scene import PointLight, Scene
 from jaxprt.scene import origin as origins
 from jaxprt.scene.mesh import areas
 from jaxprt.systems import axes, bright_texels, lamps, lobe
-from jaxprt.systems.lamps import LitByLamps
+from jaxprt.systems.lamps import LampTransport, LitByLamps
 from jaxprt.systems.protocol import System
 
 _LOBES = 12  # number of lobes for a BRDF whose system has no table of lobes
@@ -42,6 +42,22 @@ class SceneLamps(eqx.Module):
     emitting: tuple[int, ...] = eqx.field(static=True)
     area: tuple[Float[Array | np.ndarray, " _"], ...]
     point_lights: tuple[PointLight, ...]
+
+    def transport(self, place: Place) -> LampTransport:
+        """The transport to the vertices of all parts, in their order.
+
+        Args:
+            place: Where the vertices of the parts stand in the groups.
+        """
+        groups = [(place.vertices(number), lit.transport) for number, lit in enumerate(self.group)]
+        order = np.argsort(np.concatenate([vertex for vertex, _ in groups]))
+
+        def column(name: str, axis: int) -> np.ndarray:
+            rows = [np.take(np.asarray(getattr(own, name)), np.arange(len(vertex)), axis) for vertex, own in groups]
+            return np.take(np.concatenate(rows, axis), order, axis)
+
+        moments = [column(name, -1) for name in ("solid_angle", "cosine", "direction")]
+        return LampTransport(*jax.device_put((*moments, column("position", 0), column("frame", 0))), groups[0][1].lamp)
 
     def radiance(self, appearances: Sequence[Appearance], changed: Mapping[str, PointLight]) -> Float[Array, "n 3"]:
         """Radiance of each lamp: the mean over the area of an emitting part, or the intensity of a point light.

@@ -20,6 +20,7 @@ from jaxprt.systems.bounces import GroupBounces, ReflectingPart, traced
 from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.harmonic import TransferVector
+from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.lobe import LobeBrdf, LobeSystem
 from jaxprt.systems.protocol import System
 
@@ -49,8 +50,10 @@ def check(count: int | str | None) -> None:
         raise ValueError(f"bounces must be at least 0, and below 2^31, or {ALL!r}, got {count}")
 
 
-def make(shadings: Sequence[Shading], place: Place, count: int | str, target: Target) -> GroupBounces:
-    """Precomputes the light that all parts reflect onto each other and themselves.
+def make(
+    shadings: Sequence[Shading], place: Place, count: int | str, target: Target, lamps: LampTransport | None = None
+) -> GroupBounces:
+    """Precomputes the light of the environment and of lamps that all parts reflect onto each other and themselves.
 
     In a scene of more than 16 parts, those parts of a group whose materials are similar send light with the mean of
     their materials. Patches add the differences between their colors, as for textures.
@@ -60,6 +63,7 @@ def make(shadings: Sequence[Shading], place: Place, count: int | str, target: Ta
         place: Where the vertices of the parts stand in their groups.
         count: Number of bounces, at least 1; or "all".
         target: Size of the light, and where and how to compute. All parts occlude each other, and all vertices are lit.
+        lamps: Transport of the lamps to the vertices of all parts; None without lamps.
 
     Returns:
         The system of reflected light alone.
@@ -75,7 +79,9 @@ def make(shadings: Sequence[Shading], place: Place, count: int | str, target: Ta
     weights = [_mean([typical[part] for part in parts], [place.counts[part] for part in parts]) for parts in members]
     options = {"edge": min(_EDGE, target.size), **target.options("bounces")}
     # Omit nothing: the number of bounces is decided, and later materials may reflect more.
-    tensor = bounces.precompute(mesh, [each.brdf for each in sent], weights=weights, bounces=count, **options)
+    tensor = bounces.precompute(
+        mesh, [each.brdf for each in sent], weights=weights, lamps=lamps, bounces=count, **options
+    )
     groups = []
     for number, (shading, path) in enumerate(zip(first, of_group, strict=True)):
         own = [shadings[part].mesh for part in place.parts[number]]

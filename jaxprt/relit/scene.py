@@ -77,7 +77,7 @@ class RelitScene(System):
         surfaces: One `Surface` for each group of parts of one kind.
         appearance: The materials at the vertices of each group.
         bounces: The system of light that the parts reflect onto each other; None without bounces.
-        lamps: Emitting parts and point lights; None if there are none. `bounces` does not include their light.
+        lamps: Emitting parts and point lights; None if there are none.
         mesh: The mesh of all parts, with the original normals (without normal maps).
         drawn: The same mesh, padded.
         table: The materials of all parts as columns.
@@ -237,8 +237,8 @@ class RelitScene(System):
         if self.table.frame is not None:
             every = zip(self.surfaces, direct, strict=True)
             direct = tuple(own.system.tilted(lit, own.frame[:, 2]) for own, lit in every)
-        reflected = None if self.bounces is None else self.bounces.shade(light.transferred, blends)
         lamp = None if self.lamps is None else self.lamps.radiance(self._all(appearances), changed)
+        reflected = None if self.bounces is None else self.bounces.shade(light.transferred, blends, lamp)
         return Arriving(direct, reflected, lamp)
 
     @promoted

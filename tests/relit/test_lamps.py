@@ -149,6 +149,32 @@ def test_gradients_in_color_and_strength_are_what_lamps_send():
     np.testing.assert_allclose(jax.jit(sent)(*one), sent(*one), rtol=1e-5)
 
 
+@functools.cache
+def hollow(bounces: int | str) -> RelitScene:
+    """A hollow sphere that glows inside."""
+    ball = builtin.sphere(rings=10, sectors=16)
+    inside = make_mesh(ball.position, ball.face[:, ::-1], normal=-ball.normal)
+    glowing = TexturedMaterial(base_color=0.5, metallic=0.0, specular=0.0, emissive=1.0)
+    options = {"refine": False, "system": Harmonics(degree=2), "size": 8, "progress": False}
+    return prt.precompute(Scene([Part("hollow", inside, glowing)]), bounces=bounces, **options)
+
+
+@pytest.mark.parametrize(("bounces", "share"), [(2, 0.75), ("all", 1.0)])
+def test_light_of_lamps_is_reflected_any_number_of_times(bounces, share):
+    """In a hollow sphere of albedo 1/2 each bounce has half of the light of the one before it."""
+    eye = jnp.array([0.1, 0.2, 0.3])
+    whole, direct = (scene.radiance(DARK, eye=eye) for scene in (hollow(bounces), hollow(bounces).without_bounces()))
+    np.testing.assert_allclose(direct, 1.5, rtol=0.02)  # 1 is the emission; the sphere has flat faces
+    np.testing.assert_allclose(whole - direct, share * (direct.mean() - 1), rtol=0.01)
+
+
+def test_reflected_light_of_lamps_is_linear_in_their_color(close):
+    eye, red = jnp.array([0.1, 0.2, 0.3]), (3.0, 0.0, 0.0)
+    glowing = TexturedMaterial(base_color=0.5, metallic=0.0, specular=0.0, emissive=red)
+    color = hollow(2).radiance(DARK, eye=eye, materials={"hollow": glowing})
+    close(color, np.asarray(hollow(2).radiance(DARK, eye=eye)) * red)
+
+
 def test_probes_see_the_light_and_the_parts_where_they_are(close):
     """Far above, a probe sees the environment alone; near the panel, the panel's radiance in its direction."""
     around = Environment(jnp.asarray(np.random.default_rng(2).uniform(size=(6, 8, 8, 3)).astype(np.float32)))

@@ -20,6 +20,7 @@ from jaxprt.systems.bounces import functions, gather, jobs, patches
 from jaxprt.systems.bounces.patches import Patches
 from jaxprt.systems.bounces.tensor import SecondBounce, TransferTensor, scales, twice
 from jaxprt.systems.dynamic import DynamicBrdf
+from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.visibility.arguments import PRECOMPUTE
 
@@ -35,6 +36,7 @@ def precompute(
     brdfs: Sequence[DynamicBrdf | SeparableBrdf],
     *,
     weights: Sequence[Float[Array, "_ _"] | None] | None = None,
+    lamps: LampTransport | None = None,
     bounces: int | str = 2,
     least: float = 0.0,
     components: int = 32,
@@ -57,6 +59,7 @@ def precompute(
             `jaxprt.bounces.factor`, or one factored BRDF that cannot change.
         weights: For each region, typical weights of the BRDF's channels k in each color, [k, c]. They are used to
             estimate `worth`. None for a set, and for a BRDF whose channels are colors.
+        lamps: Transport of lamps to the vertices of the mesh, whose light is reflected too; None without lamps.
         bounces: Number of times that light is reflected, or "all" for as many as contribute. Bounces after the second
             are diffuse, between patches.
         least: Smallest worth of the second bounce; see `TransferTensor.worth`. If it is worth less, it is omitted.
@@ -78,8 +81,9 @@ def precompute(
     Raises:
         TypeError: `mesh` is not a `Mesh`, `brdfs` is not a list, or a BRDF is neither a set nor factored.
         ValueError: There is not one BRDF for each region; weights have another number of channels or are not finite; a
-            set has no terms, or has lobes; `bounces` is neither "all" nor a whole number of at least 1; `least` is not
-            in [0, 1); another number is below 1; or `edge` is not a power of two.
+            set has no terms, or has lobes; `lamps` has other vertices than the mesh; `bounces` is neither "all" nor a
+            whole number of at least 1; `least` is not in [0, 1); another number is below 1; or `edge` is not a power
+            of two.
 
     Reference: Sun et al. 2007, sections 3.1 and 4.3.
     """
@@ -87,6 +91,8 @@ def precompute(
     weights = [None] * len(brdfs) if weights is None else weights
     _check_weights(weights, brdfs)
     _check_sizes(bounces, least, components, modes, edge, size, patches)
+    if lamps is not None:
+        require.length("vertices of the lamps' transport", lamps.position, len(mesh.position))
     bases = tuple(jax.tree.map(np.asarray, functions.basis(brdf)) for brdf in brdfs)
     factor = tuple(each.factor if isinstance(each, DynamicBrdf) else functions.fixed_weights(each) for each in brdfs)
     if path is not None:
@@ -96,7 +102,8 @@ def precompute(
     member = separable.members.cluster(mesh.position, mesh.normal, clusters=max(1, round(len(region) / _MEMBERS)))
     parts = {
         "bases": bases,
-        "response": _responses(mesh, bases, numbers, edge, run),
+        "response": _responses(mesh, bases, numbers, edge, lamps, run),
+        "lamps": 0 if lamps is None else lamps.lamps,
         "white": np.concatenate([_white(*each) for each in zip(factor, weights, strict=True)]),
         "scale": np.asarray(scales(factor)),
         "region": np.searchsorted(numbers, region),
@@ -109,14 +116,21 @@ def precompute(
     function = np.flatnonzero(contribution >= least)
     worth = [_rms(found["white"])]
     weight, core = found["weight"].reshape(*member.shape, -1), found["core"][..., function]
+    lamp = None
+    if lamps is not None:
+        lamp = found["lamp_weight"].reshape(*member.shape, -1), found["lamp"][..., function]
     job, parts = job.without_response(), None
     second, brought_twice = None, np.zeros(0)
     if bounces != 1 and function.size:
-        again = job.again(weight, core, found["mode"], function, components=min(twice(components), member.shape[1]))
+        fewer = min(twice(components), member.shape[1])
+        again = job.again(weight, core, found["mode"], lamp, function, components=fewer)
         second, brought_twice = _second(again, member, job.white[function], least, run)
         worth.append(_rms(brought_twice))
     exchange = _Exchange(mesh, job, patches, None if bounces == ALL else int(bounces), run)
-    made = exchange.make(bases, function, weight, None if second is None else np.asarray(second.weight), edge)
+    core_of_lamps = None
+    if lamp is not None:
+        weight, core_of_lamps = np.concatenate([weight, lamp[0]], -1), jax.device_put(lamp[1])
+    made = exchange.make(bases, function, weight, None if second is None else np.asarray(second.weight), edge, lamps)
     if second is not None and bounces != 2:
         worth += exchange.worth(made, job.white[function], function, brought_twice)
     if progress:
@@ -125,6 +139,7 @@ def precompute(
     arrays = [jax.device_put(each) for each in (weight, core, found["mode"], *rows, function)]
     judged = jnp.asarray(found["error"]), jnp.asarray(worth, arrays[0].dtype)
     made_of = {"factor": factor, "second": second, "mesh": visibility.blocks.scene_key(mesh), "patches": made}
+    made_of["lamp"] = core_of_lamps
     return TransferTensor(*arrays, **made_of, error=judged[0], worth=judged[1])
 
 
@@ -166,8 +181,9 @@ class _Exchange(NamedTuple):
         weight: np.ndarray,
         again: np.ndarray | None,
         edge: int,
+        lamps: LampTransport | None,
     ) -> Patches:
-        """The patches, given the weights of the components of one bounce and of two."""
+        """The patches, given the weights of the components of one bounce and of two, and the lamps."""
         position, normal = (np.asarray(each, np.float64) for each in (self.mesh.position, self.mesh.normal))
         count = min(self.wanted, max(1, len(position) // patches.LEAST))
         member, region = self.job.member, self.job.region
@@ -194,6 +210,10 @@ class _Exchange(NamedTuple):
         second = None if again is None else jnp.asarray(of_components(again))
         factor, spread, *of_patch, between, light, once = (jnp.asarray(each) for each in (*arrays, *ours))
         more = {"second": second, "strength": tuple(strength), "bounces": self.bounces}
+        if lamps is not None:
+            pieces = mean.of(np.asarray(lamps.cosine).T / np.float32(np.pi))
+            of_lamp = np.asarray(lamps.lamp)[:, None] == np.arange(lamps.lamps)
+            more["lamp"] = jnp.asarray(pieces @ of_lamp.astype(pieces.dtype))
         return Patches(factor, spread, *of_patch, between=between, light=light, first=once, **more)
 
     def worth(self, made: Patches, white: np.ndarray, function: np.ndarray, twice: np.ndarray) -> list[float]:
@@ -262,17 +282,31 @@ def _check_sizes(
         )
 
 
-def _responses(mesh: Mesh, bases: Sequence, numbers: np.ndarray, edge: int, run: _Run) -> tuple[np.ndarray, ...]:
-    """Response of the light factors of each region to direct light."""
-    result = []
+def _responses(
+    mesh: Mesh, bases: Sequence, numbers: np.ndarray, edge: int, lamps: LampTransport | None, run: _Run
+) -> tuple[np.ndarray, ...]:
+    """Response of the light factors of each region to each texel of the environment, and to each lamp."""
+    result, count = [], 0 if lamps is None else lamps.lamps
     for number, basis in zip(numbers.tolist(), bases, strict=True):
         vertex = np.flatnonzero(np.asarray(mesh.region) == number)
         job = jobs.ResponseJob.make(mesh, None, vertex, _SEEN * edge, basis=basis, edge=edge)
         found = run.compute(job, f"response_{number}", f"region {number}")["response"]
-        padded = np.zeros((shared_size(len(vertex)), *found.shape[:0:-1]), found.dtype)
-        padded[: len(vertex)] = found.swapaxes(1, 2)
+        texels, terms = found.shape[1:]
+        padded = np.zeros((shared_size(len(vertex)), terms, texels + count), found.dtype)
+        padded[: len(vertex), :, :texels] = found.swapaxes(1, 2)
+        if lamps is not None:
+            padded[: len(vertex), :, texels:] = _to_lamps(lamps, basis, vertex)
         result.append(padded)
     return tuple(result)
+
+
+def _to_lamps(lamps: LampTransport, basis: SeparableBrdf, vertex: np.ndarray) -> np.ndarray:
+    """Response of light factors to lamps at some vertices."""
+    row = np.resize(vertex, shared_size(len(vertex)))  # repeated to a size that scenes share
+    moment = [np.asarray(column)[..., row] for column in (lamps.solid_angle, lamps.cosine, lamps.direction)]
+    place = np.asarray(lamps.position)[row], np.asarray(lamps.frame)[row]
+    few = LampTransport(*jax.device_put((*moment, *place)), lamps.lamp)
+    return np.asarray(gather.respond_to_lamps(few, few.frame, basis))[: len(vertex)]
 
 
 def _second(
@@ -281,12 +315,18 @@ def _second(
     """The second bounce, or None if a sample of clusters shows too little worth; and its irradiance at vertices."""
     if least > 0:
         sample = np.linspace(0, len(member) - 1, min(_SAMPLE, len(member))).astype(int)
-        brought = np.concatenate([job.brought(job.tensor(member[each]), member[each], white) for each in sample])
+        texels = job.response[0].shape[2] // len(job.function) - job.lamps
+        brought = np.concatenate(
+            [job.brought(job.tensor(member[each])[:, :texels], member[each], white) for each in sample]
+        )
         if _rms(brought) < least:
             return None, brought
     found = run.compute(job, "clusters_2", "bounce 2")
-    parts = (found["weight"].reshape(*member.shape, -1), found["core"], found["error"])
-    return SecondBounce(*map(jax.device_put, parts)), found["white"]
+    weight, lamp = found["weight"].reshape(*member.shape, -1), None
+    if job.lamps:
+        weight = np.concatenate([weight, found["lamp_weight"].reshape(*member.shape, -1)], -1)
+        lamp = jax.device_put(found["lamp"])
+    return SecondBounce(*map(jax.device_put, (weight, found["core"], found["error"])), lamp), found["white"]
 
 
 def _white(factor: Array, channel: Array | None) -> np.ndarray:

@@ -21,6 +21,7 @@ from jaxprt import visibility
 from jaxprt.compile import jit
 from jaxprt.sphere import cubemap, directions, haar, harmonics, rotation
 from jaxprt.systems.bounces import functions
+from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.separable import SeparableBrdf
 
 DEGREE = 3  # degree of the harmonics that arrive
@@ -70,6 +71,28 @@ def respond_again(
     """
     local = rotation.rotate_each(arriving, frame)
     return jnp.einsum("sqb,sk->bqk", local, functions.project(basis, degree=harmonics.degree_of(len(arriving))))
+
+
+@jit
+def respond_to_lamps(
+    transport: LampTransport, frame: Float[Array, "v 3 3"], basis: SeparableBrdf
+) -> Float[Array, "v k i"]:
+    """Response of light factors to lamps of radiance 1, for each lamp i.
+
+    The light of each piece of a lamp comes from the mean direction in which it is seen.
+
+    Args:
+        transport: Transport of the lamps to the vertices.
+        frame: Frame of each vertex; rows are tangent, bitangent, normal.
+        basis: Functions of the surfaces, from `jaxprt.bounces.functions.basis`.
+
+    Returns:
+        Integrals over the visible part of each lamp of light factor x cosine.
+    """
+    wi = directions.normalize(jnp.einsum("vij,mjv->mvi", frame, transport.direction, precision="highest"))
+    piece = basis.light(wi)[..., 0] * transport.cosine[..., None]
+    lamp = jax.ops.segment_sum(piece, np.asarray(transport.lamp), transport.lamps, indices_are_sorted=True)
+    return jnp.moveaxis(lamp, 0, -1)
 
 
 class Rays(NamedTuple):

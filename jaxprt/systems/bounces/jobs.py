@@ -65,7 +65,8 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
     Attributes:
         bases: Functions of each region.
         response: Responses of their light factors, at the vertices of each region, padded to a size that scenes share;
-            the light is the last axis.
+            the light is the last axis: texels of the environment, and then lamps.
+        lamps: Number of lamps.
         white: Weights of all functions with which the worth of a bounce is estimated.
         scale: Weights of all functions in the errors of decompositions.
         region: Index of each vertex's region.
@@ -75,6 +76,7 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
 
     bases: tuple[SeparableBrdf, ...]
     response: tuple[np.ndarray, ...]
+    lamps: int
     white: np.ndarray
     scale: np.ndarray
     region: np.ndarray
@@ -88,7 +90,8 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
         maps = [basis.coordinates.__name__ for basis in self.bases]
         made = visibility.blocks.fingerprint(*(np.asarray(each, np.int64) for each in (self.region, self.member)))
         kinds = self.response[0].shape[2]
-        own = {"kinds": kinds, "maps": maps, "made": made, "components": self.components}
+        lamps = {"lamps": self.lamps} if self.lamps else {}
+        own = {"kinds": kinds, "maps": maps, "made": made, "components": self.components} | lamps
         return self.made_by(self.system, ALGORITHM, **own)
 
     @property
@@ -131,6 +134,22 @@ class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
             result.append(np.asarray(arrived)[: len(part)])
         return np.concatenate(result, 2)
 
+    def lamp_layout(self, *functions: int) -> Mapping[str, Layout]:
+        """Shapes of what one block holds for lamps; nothing without lamps."""
+        if not self.lamps:
+            return {}
+        core = (1, self.lamps, self.components, (DEGREE + 1) ** 2, *functions)
+        return {"lamp_weight": Layout((self.step, self.components), 0, "float32"), "lamp": Layout(core, 0, "float16")}
+
+    def lamp_rows(
+        self, tensor: Float[np.ndarray, "b i s *q"], scale: Float[np.ndarray, "*q"]
+    ) -> Mapping[str, np.ndarray]:
+        """Components of light from lamps: weights of the vertices of a cluster, and the core. Nothing without lamps."""
+        if not self.lamps:
+            return {}
+        weight, core, _ = _along_vertices(jax.device_put(tensor * scale), components=self.components)
+        return {"lamp_weight": np.asarray(weight), "lamp": (np.asarray(core) / scale)[None]}
+
     def brought(self, tensor: Float[np.ndarray, "b l s *q"], part: np.ndarray, white: np.ndarray) -> np.ndarray:
         """Irradiance over pi at each vertex of a part, for given weights of functions, under uniform light."""
         met = np.sum(tensor, 1)
@@ -161,23 +180,26 @@ class TransferJob(_PathJob):
         return {
             "weight": Layout((self.step, self.components), 0, "float32"),
             "core": Layout((1, self.modes, self.components, harmonic, functions), 0, "float16"),
-            "mode": Layout((1, self.response[0].shape[2], self.modes), 0, "float32"),
+            "mode": Layout((1, self.response[0].shape[2] - self.lamps, self.modes), 0, "float32"),
             "error": Layout((1,), 0, "float32"),
             "energy": Layout((1, functions), 0, "float32"),
             "white": Layout((self.step,), 0, "float32"),
+            **self.lamp_layout(functions),
         }
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         """One block."""
-        tensor = self.tensor(self.member[block])
+        whole = self.tensor(self.member[block])
+        tensor, lamp = np.split(whole, [whole.shape[1] - self.lamps], 1)
         count, light, harmonic, functions = tensor.shape
         flat = jax.device_put((tensor * self.scale).reshape(count, light, -1))
         weight, core, mode, error = compress(flat, components=self.components, modes=self.modes)
         core = np.asarray(core).reshape(1, *core.shape[:2], harmonic, functions) / self.scale
         white = self.brought(tensor, self.member[block], self.white)
-        energy = np.sum(tensor**2, (0, 1, 2))[None]
+        energy = np.sum(whole**2, (0, 1, 2))[None]
         rows = {"weight": weight, "core": core, "mode": mode[None], "error": error[None], "energy": energy}
-        return {name: np.asarray(each) for name, each in (rows | {"white": white}).items()}, 0
+        rows |= {"white": white, **self.lamp_rows(lamp, self.scale)}
+        return {name: np.asarray(row) for name, row in rows.items()}, 0
 
     def tensor(self, part: np.ndarray) -> Float[np.ndarray, "b l s q"]:
         """The light that arrives at some vertices, before compression."""
@@ -189,22 +211,41 @@ class TransferJob(_PathJob):
         return replace(self, response=none)
 
     def again(
-        self, weight: np.ndarray, core: np.ndarray, mode: np.ndarray, function: np.ndarray, *, components: int
+        self,
+        weight: np.ndarray,
+        core: np.ndarray,
+        mode: np.ndarray,
+        lamp: tuple[np.ndarray, np.ndarray] | None,
+        function: np.ndarray,
+        *,
+        components: int,
     ) -> "AgainJob":
-        """The job of the second bounce, off surfaces that the first one lights."""
-        fine = math.isqrt(self.response[0].shape[2] // 6)
+        """The job of the second bounce, off surfaces that the first one lights.
+
+        Args:
+            weight: Weights of the components of each vertex, from the first bounce.
+            core: Cores of the clusters.
+            mode: Modes of the light.
+            lamp: Weights and cores of light from lamps; None without lamps.
+            function: Indices of the functions that are kept.
+            components: Number of components of the second bounce.
+        """
+        fine = math.isqrt((self.response[0].shape[2] - self.lamps) // 6)
         edge = min(_AGAIN, fine)
         shape = (len(mode), 6, edge, fine // edge, edge, fine // edge, -1)
         coarse = mode.reshape(shape).sum((3, 5)).reshape(len(mode), 6 * edge * edge, -1)
-        count = coarse.shape[1] * len(function)
+        count = (coarse.shape[1] + self.lamps) * len(function)
         counts = [np.sum(self.region == number) for number in range(len(self.bases))]
         pairs = zip(counts, self.bases, strict=True)
         response = [np.zeros((shared_size(int(n)), b.terms, count), np.float32) for n, b in pairs]
         local = np.zeros(len(self.region), np.int32)
         for number, each in enumerate(counts):
             local[self.region == number] = np.arange(each)
-        for member, *parts in zip(self.member, weight, core, coarse, strict=True):
+        for cluster, (member, *parts) in enumerate(zip(self.member, weight, core, coarse, strict=True)):
             arriving = _expand(*map(jax.device_put, parts))
+            if lamp is not None:
+                from_lamps = _expand(*jax.device_put((lamp[0][cluster], lamp[1][cluster], np.eye(self.lamps))))
+                arriving = jnp.concatenate([arriving, from_lamps.astype(arriving.dtype)], 1)
             for number, basis in enumerate(self.bases):
                 own = self.region[member] == number
                 if own.any():
@@ -234,24 +275,27 @@ class AgainJob(_PathJob):
     def layout(self) -> Mapping[str, Layout]:
         """Shapes of one block."""
         functions = len(self.function)
-        light = self.response[0].shape[2] // functions
+        light = self.response[0].shape[2] // functions - self.lamps
         shape = (1, light, self.components, (DEGREE + 1) ** 2, functions, functions)
         return {
             "weight": Layout((self.step, self.components), 0, "float32"),
             "core": Layout(shape, 0, "float16"),
             "error": Layout((1,), 0, "float32"),
             "white": Layout((self.step,), 0, "float32"),
+            **self.lamp_layout(functions, functions),
         }
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         """One block."""
         tensor = self.tensor(self.member[block])
+        tensor, lamp = np.split(tensor, [tensor.shape[1] - self.lamps], 1)
         scale = self.scale[self.function]
         both = scale[:, None] * scale
         weight, core, error = _along_vertices(jax.device_put(tensor * both), components=self.components)
         rows = {"weight": weight, "core": (np.asarray(core) / both)[None], "error": error[None]}
         white = self.brought(tensor, self.member[block], self.white[self.function])
-        return {name: np.asarray(each) for name, each in (rows | {"white": white}).items()}, 0
+        rows |= {"white": white, **self.lamp_rows(lamp, both)}
+        return {name: np.asarray(row) for name, row in rows.items()}, 0
 
     def tensor(self, part: np.ndarray) -> Float[np.ndarray, "b l s q q"]:
         """The light that arrives at some vertices, before compression."""
@@ -313,6 +357,9 @@ def _scaled(vertex: Array, core: Array) -> tuple[Array, Array]:
 
 @jit
 def _expand(weight: Array, core: Array, coarse: Array) -> Array:
-    """Light that arrives at the vertices of a cluster from each coarse texel and function, [harmonic, l q, vertex]."""
+    """Light that arrives at the vertices of a cluster from each coarse texel and function, [harmonic, l q, vertex].
+
+    For lamps, `coarse` is the identity.
+    """
     met = jnp.einsum("le,ensq->nslq", coarse, core.astype(weight.dtype))
     return jnp.einsum("mn,nslq->slqm", weight, met).reshape(core.shape[2], -1, len(weight))

@@ -162,20 +162,28 @@ class GroupBounces(eqx.Module):
         return light_side(self.tensor, environment)
 
     @promoted
-    def shade(self, light: LitTransfer, materials: Sequence[Blend | None]) -> tuple[Float[Array, "lm _ _"], ...]:
+    def shade(
+        self, light: LitTransfer, materials: Sequence[Blend | None], lamp: Float[Array, "i c"] | None = None
+    ) -> tuple[Float[Array, "lm _ _"], ...]:
         """Harmonics of the light that arrives at the vertices of each group, in their frames, given all materials.
 
         Args:
             light: The result of `light`.
             materials: Weights at the vertices of each group; None for a group with a BRDF that cannot change.
+            lamp: Radiance of each lamp; None without lamps.
+
+        Raises:
+            ValueError: The tensor was made for another number of lamps.
         """
         require.kind("the light", light, LitTransfer, source="GroupBounces.light")
-        return _arriving(self, light, tuple(materials))
+        if lamp is not None:
+            require.length("rows of the lamps' radiance", lamp, self.tensor.lamps)
+        return _arriving(self, light, tuple(materials), lamp)
 
 
 @jit
 def _arriving(
-    system: GroupBounces, light: LitTransfer, materials: tuple[Blend | None, ...]
+    system: GroupBounces, light: LitTransfer, materials: tuple[Blend | None, ...], lamp: Array | None
 ) -> tuple[Float[Array, "lm _ _"], ...]:
     rows, changes = [], []
     for own, members, factor, strength, blend in zip(
@@ -189,7 +197,7 @@ def _arriving(
         none = [jnp.zeros((len(own.position), 1), own.position.dtype) for own in system.group]
         pairs = zip(changes, none, strict=True)
         change = _stacked([zero if each is None else each for each, zero in pairs])[system.place]
-    arriving = collect(system.tensor, light, weight, change=change)
+    arriving = collect(system.tensor, light, weight, change=change, lamp=lamp)
     pairs = zip(system.group, system.members, strict=True)
     return tuple(harmonic.local_light(own.frame, arriving[..., members.vertex]) for own, members in pairs)
 

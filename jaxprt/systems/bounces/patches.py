@@ -50,6 +50,7 @@ class Patches(eqx.Module):
         second: The same for two bounces; None without a second bounce.
         strength: Hemispherical albedo of the functions of each region; zero for functions that the tensor omits.
         bounces: Total number of bounces; None for as many as contribute.
+        lamp: Irradiance over pi of each patch from each lamp of radiance 1; None without lamps.
     """
 
     factor: Float16[Array, "v j"]
@@ -59,17 +60,11 @@ class Patches(eqx.Module):
     cluster: Int[Array, " j"]
     between: Float[Array, "j j"]
     light: Float[Array, "j l"]
-    first: Float[Array, "j n s"]
-    second: Float[Array, "j o s"] | None
+    first: Float[Array, "j _ s"]
+    second: Float[Array, "j _ s"] | None
     strength: tuple[Float[Array, " _"], ...]
     bounces: int | None = eqx.field(static=True)
-
-    def truncate(self, components: int, again: int) -> "Patches":
-        """Keeps the first components of the tensor, for one bounce and for two."""
-        second = None if self.second is None else self.second[:, :again]
-        return eqx.tree_at(
-            lambda each: (each.first, each.second), self, (self.first[:, :components], second), is_leaf=_is_none
-        )
+    lamp: Float[Array, "j i"] | None = None
 
     def albedo(self, function: Int[Array, " q"], weight: Float[Array, "q d"]) -> Float[Array, "j d"]:
         """Mean albedo of the region of each patch, given the weights of the functions that the tensor keeps."""
@@ -164,10 +159,6 @@ class Patches(eqx.Module):
             self.factor[first : first + step].astype(sent.dtype) @ sent for first in range(0, len(self.patch), step)
         ]
         return self.spread.T[:, None] * jnp.concatenate(rows).T
-
-
-def _is_none(value: Any) -> bool:
-    return value is None
 
 
 @dataclass(frozen=True)

@@ -217,6 +217,7 @@ def collect(
     weight: Float[Array, "q d"],
     *,
     change: Float[Array, "v e"] | None = None,
+    lamp: Float[Array, "i c"] | None = None,
 ) -> Float[Array, "s _ v"]:
     """SH coefficients, in world directions, of the reflected radiance that arrives at each vertex.
 
@@ -225,24 +226,39 @@ def collect(
         light: Result of `light_side`.
         weight: Result of `weights`.
         change: Result of `changes`; None for zero.
+        lamp: Radiance of each lamp; None without lamps.
     """
     # Multiply and sum along the last axes: for an einsum, XLA on CPUs would transpose the large operands first.
-    met, row = jnp.sum(light.first * weight.T[:, None, None], -1), tensor.weight
+    met, row, matte = jnp.sum(light.first * weight.T[:, None, None], -1), tensor.weight, light.matte
+    if lamp is not None and tensor.lamp is not None:
+        met = _beside(met, jnp.einsum("ginsq,iqc->gcns", tensor.lamp.astype(met.dtype), lamp[:, None] * weight))
+        if matte is not None:
+            matte = matte + tensor.patches.lamp @ lamp
     once, twice = met, None
     if light.second is not None and tensor.second is not None:
         both = weight.T[:, :, None] * weight.T[:, None]
         twice = jnp.sum(light.second * both[:, None, None], (-2, -1))
-        met, row = jnp.concatenate([met, twice], 2), jnp.concatenate([row, tensor.second.weight], -1)
+        if lamp is not None and tensor.second.lamp is not None:
+            core = tensor.second.lamp.astype(twice.dtype)
+            paths = lamp[:, None, None] * weight[:, None] * weight  # [i q p c]
+            twice = _beside(twice, jnp.einsum("giosqp,iqpc->gcos", core, paths))
+        met, row = _beside(met, twice), jnp.concatenate([row, tensor.second.weight], -1)
     clusters, colors, components, harmonic = met.shape
     rows = row @ jnp.moveaxis(met, 2, 1).reshape(clusters, components, colors * harmonic)
     whole = rows.reshape(-1, colors, harmonic)[tensor.place].transpose(2, 1, 0)
     no_more = tensor.patches is None or twice is None or tensor.patches.bounces == 2
-    if light.matte is None or (change is None and no_more):
+    if matte is None or (change is None and no_more):
         return whole
     assert tensor.patches is not None
     mean = tensor.patches.albedo(tensor.function, weight)
     off = None if change is None else tensor.patches.means(change, tensor.area)
-    return whole + tensor.patches.arriving(mean, off, light.matte, once, twice)
+    return whole + tensor.patches.arriving(mean, off, matte, once, twice)
+
+
+def _beside(first: Float[Array, "g c n s"], second: Float[Array, "g d m s"]) -> Float[Array, "g e _ s"]:
+    """Components one after another. Gray ones are repeated to the colors of the others."""
+    colors = max(first.shape[1], second.shape[1])
+    return jnp.concatenate([jnp.broadcast_to(x, (len(x), colors, *x.shape[2:])) for x in (first, second)], 2)
 
 
 def view_side(

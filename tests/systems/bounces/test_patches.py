@@ -187,15 +187,6 @@ def test_one_triangle_has_one_patch_and_no_reflected_light():
     np.testing.assert_array_equal(shown(system), 0)
 
 
-def test_fewer_components_keep_the_light_of_all_bounces():
-    tensor = settled().tensor.truncate(16, modes=20)
-    assert tensor.patches.first.shape[1] == 16
-    short = shown(GroupBounces.make(tensor, settled().group, [np.arange(len(tensor.region))]))
-    np.testing.assert_allclose(short.mean(), shown(settled()).mean(), rtol=0.01)
-    small = settled().tensor.shorten(nbytes=tensor.nbytes)
-    assert small.nbytes <= tensor.nbytes
-
-
 @pytest.mark.usefixtures("unchecked")
 def test_numbers_of_patches_and_bounces_that_are_none_are_refused():
     for options, message in (

@@ -212,29 +212,6 @@ def test_fewer_components_and_modes_err_as_they_say(mesh, brdfs, whole):
     exact, found = (arriving(each, lamp, weight)[0] for each in (whole, cut))
     assert float(cut.error[0]) > 0.01
     np.testing.assert_allclose(relative(found, exact), float(cut.error[0]), rtol=1e-3)
-    shorter = whole.truncate(20, modes=24)
-    np.testing.assert_allclose(shorter.error, cut.error, rtol=5e-3)
-    exact, short, found = (arriving(each, light(3))[0] for each in (whole, shorter, cut))
-    np.testing.assert_allclose(relative(short, exact), relative(found, exact), rtol=1e-3)
-    with pytest.raises(ValueError, match=r"at most \(51, 96\), got 0, 3"):
-        whole.truncate(0, modes=3)
-
-
-def test_the_shortest_tensor_of_an_error_and_the_best_of_a_size(whole):
-    few = whole.shorten(error=0.1)
-    assert 0.05 < float(few.error[0]) <= 0.1
-    components, modes = few.core.shape[2], few.core.shape[1]
-    assert float(whole.truncate(components - 1, modes=modes).error[0]) > 0.1
-    assert float(whole.truncate(components, modes=modes - 1).error[0]) > 0.1
-    small = whole.shorten(nbytes=few.nbytes)
-    assert small.nbytes <= few.nbytes
-    assert float(small.error[0]) <= float(few.error[0])
-    with pytest.raises(ValueError, match="give either error or nbytes, got error=None and nbytes=None"):
-        whole.shorten()
-    with pytest.raises(ValueError, match=r"nbytes must be at least \d+, got 10"):
-        whole.shorten(nbytes=10)
-    with pytest.raises(ValueError, match="error must be at least"):
-        few.shorten(error=0.01)
 
 
 @pytest.fixture(scope="module")
@@ -342,9 +319,3 @@ def test_weights_of_other_regions_and_channels_are_refused(mesh, brdfs, changing
         "region 0 must be None because it has a set of BRDFs, got an array",
         [changing, brdfs[1]],
     )
-
-
-def test_the_default_number_of_components_keeps_the_light_of_two_bounces(whole):
-    short = whole.truncate(32, modes=64)
-    found, exact = (np.sum(arriving(each, light(4))[1][:, 0]) for each in (short, whole))
-    assert found > 0.98 * exact
