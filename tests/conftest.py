@@ -53,8 +53,9 @@ MAPPINGS, RESIDENT = 40_000, 4e9
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Adds the option that writes tests/programs.json."""
+    """Adds the options of `tests/programs.py` and `tests/test_contract.py`."""
     parser.addoption("--keep-programs", action="store_true", help="keep how many programs each test file asks for")
+    parser.addoption("--only", default="", help="the contract's rules for functions with this word in their name alone")
 
 
 def pytest_configure(config: pytest.Config) -> None:

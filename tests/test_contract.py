@@ -1021,7 +1021,26 @@ PURE = [name for name in PUBLIC if not on_host(name)]
 TAKING_ARRAYS = [name for name in PURE if name in EXAMPLES and EXAMPLES[name].build is not nothing]
 # Their residuals are rounding, and their vectors have either sign: they are held to what they give without jit.
 OF_ROUNDING = ["decompose.eigen.symmetric", "decompose.eigen.power", "decompose.eigen.left_singular"]
-each_pure = pytest.mark.parametrize("name", [name for name in PURE if name in EXAMPLES])
+# The harmonic system has lights of another kind. Jitted functions know no values; their lights were checked before.
+LIT = [name for name in PURE if ".relight." in name and "harmonic" not in name and not isinstance(PUBLIC[name], JITTED)]
+
+
+@pytest.fixture(scope="module")
+def hold(request):
+    """The function ``hold(rule, names)``: runs a rule for functions and fails with a list of those that break it."""
+    word = request.config.getoption("--only")
+
+    def hold(rule, names):
+        offenders = []
+        for name in names:
+            if word in name and name in EXAMPLES:
+                try:
+                    rule(name)
+                except Exception as error:
+                    offenders.append(f"{name}: {type(error).__name__}: {error}")
+        assert not offenders, f"{len(offenders)} functions break the rule\n" + "\n\n".join(offenders)
+
+    return hold
 
 
 def run(name: str, arrays: Call) -> Any:
@@ -1034,6 +1053,11 @@ def build(name: str, seed: int = 0) -> Call:
     return EXAMPLES[name].build(Draw(seed))
 
 
+def bound(name: str, arrays: Call) -> dict[str, Any]:
+    """Arguments by the names of the parameters."""
+    return dict(inspect.signature(PUBLIC[name]).bind_partial(*arrays.position, **arrays.name).arguments)
+
+
 def floats(tree: Any) -> list:
     """Floating-point arrays in a tree."""
     return [leaf for leaf in jax.tree.leaves(tree) if is_float(leaf)]
@@ -1042,6 +1066,11 @@ def floats(tree: Any) -> list:
 def is_float(leaf: Any) -> bool:
     """Whether a leaf is a floating-point array, or stands for the shape of one."""
     return hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jnp.inexact)
+
+
+def is_batched(name: str) -> bool:
+    """Whether `jax.vmap` is promised."""
+    return EXAMPLES[name].batch and name in TAKING_ARRAYS
 
 
 def test_every_pure_function_has_an_example():
@@ -1055,23 +1084,23 @@ def test_every_example_and_every_exception_is_of_something_public():
     assert not HOST.keys() - modules - PUBLIC.keys()
 
 
-def _entering(name: str) -> set[str]:
-    """Lights, eyes and weights among the arguments of an example."""
-    given = inspect.signature(PUBLIC[name]).bind_partial(*(arrays := build(name)).position, **arrays.name).arguments
-    return {key for key in given if key in ("eye", "weight", "excess") or isinstance(given[key], scene.Environment)}
+def test_lights_eyes_and_weights_that_are_not_finite_are_refused_by_name(hold):
+    def rule(name):
+        arguments = bound(name, build(name))
+        for key, value in arguments.items():
+            if key in ("eye", "weight", "excess") or isinstance(value, scene.Environment):
+                broken = jax.tree.map(lambda leaf: with_nan(leaf), value)
+                with pytest.raises(ValueError, match=f"the {key}s? must be finite, got 1 of"):
+                    PUBLIC[name](**arguments | {key: broken}, **EXAMPLES[name].options)
+
+    hold(rule, LIT)
 
 
-# The harmonic system has lights of another kind. Jitted functions know no values; their lights were checked when made.
-@pytest.mark.parametrize(
-    "name",
-    [name for name in PURE if ".relight." in name and "harmonic" not in name and not isinstance(PUBLIC[name], JITTED)],
-)
-def test_lights_eyes_and_weights_that_are_not_finite_are_refused_by_name(name):
-    given = dict(inspect.signature(PUBLIC[name]).bind_partial(*(a := build(name)).position, **a.name).arguments)
-    for key in _entering(name):
-        broken = jax.tree.map(lambda leaf: leaf.at[(0,) * leaf.ndim].set(jnp.nan), given[key])
-        with pytest.raises(ValueError, match=f"the {key}s? must be finite, got 1 of"):
-            PUBLIC[name](**given | {key: broken}, **EXAMPLES[name].options)
+def with_nan(leaf: Any) -> jax.Array:
+    """The array with NaN in its first place."""
+    broken = np.array(leaf)
+    broken[(0,) * broken.ndim] = np.nan
+    return jax.device_put(broken)
 
 
 def test_defaults_are_keyword_only():
@@ -1085,112 +1114,139 @@ def test_defaults_are_keyword_only():
 
 
 @functools.cache
-def single(name: str) -> tuple[Callable, Call, Any]:
-    """A function as callers use it, compiled whole or in parts, its arguments in float32 and their result."""
-    arrays = build(name)
+def single(name: str) -> tuple[Callable, list[Call], list]:
+    """A function as callers use it, compiled whole or in parts, sets of arguments in float32 and their results.
+
+    There are several sets of arguments, of the same shapes, where the function takes batches of them.
+    """
+    arrays = [build(name, seed) for seed in range(BATCH if is_batched(name) else 1)]
 
     def function(arrays):
         return run(name, arrays)
 
     if PUBLIC[name].__name__ == "__call__":
         function = jax.jit(function)
-    return function, arrays, function(arrays)
+    return function, arrays, [function(one) for one in arrays]
+
+
+class Double(NamedTuple):
+    """What a function compiled whole gives in float64 for the arguments of ``single``, for all sets at once by vmap.
+
+    Where the function is differentiable, the program is of arguments that move, by their names: it gives a weighted sum
+    of all results, the results, and derivatives of the sum.
+    """
+
+    result: Any
+    program: Callable | None
+    moving: dict[str, Any]
+    gradient: dict[str, Any]
 
 
 @functools.cache
-def double(name: str) -> tuple[Any, Callable | None, dict, dict]:
-    """What a function compiled whole gives for the arguments of ``single`` in float64.
-
-    Beside it, where the function is differentiable, the program that gave it: of arguments that move, by their names,
-    and of those that stand still it makes a weighted sum of all results, the results, and derivatives of the sum.
-    """
+def double(name: str) -> Double:
+    """A function in float64."""
     with jax.enable_x64(True):
-        wide = lambda leaf: jax.device_put(np.asarray(leaf, float)) if is_float(leaf) else leaf  # noqa: E731
-        arrays = jax.tree.map(wide, single(name)[1])
-        function, example = PUBLIC[name], EXAMPLES[name]
-        given = dict(inspect.signature(function).bind_partial(*arrays.position, **arrays.name).arguments)
-        asked = [key for key in given if floats(given[key])] if example.gradient is None else example.gradient
+        sets = [bound(name, arrays) for arrays in single(name)[1]]
+        together = jax.tree.map(lambda *leaf: np.stack(leaf), *sets) if is_batched(name) else sets[0]
+        arguments = jax.tree.map(lambda leaf: np.asarray(leaf, float) if is_float(leaf) else leaf, together)
+        options, vmap = EXAMPLES[name].options, jax.vmap if is_batched(name) else lambda function: function
+        asked = EXAMPLES[name].gradient
+        asked = [key for key in arguments if floats(arguments[key])] if asked is None else asked
         if not asked:
-            return jax.jit(lambda arrays: run(name, arrays))(arrays), None, {}, {}
-        moving, still = eqx.partition({key: given[key] for key in asked}, is_float)
-        still = still, {key: value for key, value in given.items() if key not in asked}
+            return Double(jax.jit(vmap(lambda all: PUBLIC[name](**all, **options)))(arguments), None, {}, {})
+        moving, still = eqx.partition({key: arguments[key] for key in asked}, is_float)
+        still = still, {key: value for key, value in arguments.items() if key not in asked}
 
         def weigh(moving, still):
-            result = function(**still[1] | eqx.combine(moving, still[0]), **example.options)
+            result = PUBLIC[name](**still[1] | eqx.combine(moving, still[0]), **options)
             weighed = (jnp.sum(Draw(100 + i).normal(*leaf.shape) * leaf) for i, leaf in enumerate(floats(result)))
             return sum(weighed), result
 
-        program = jax.jit(jax.value_and_grad(weigh, has_aux=True))
+        program = jax.jit(vmap(jax.value_and_grad(weigh, has_aux=True)))
         (_, result), gradient = program(moving, still)
-        return result, lambda moving: program(moving, still)[0][0], moving, gradient
+        return Double(result, lambda moving: program(moving, still)[0][0], moving, gradient)
 
 
-@each_pure
-def test_products_and_those_of_gradients_are_exact_on_gpus(name, loose):
-    function, arrays, _ = single(name)
-    assert not loose(function, arrays)
-    _, weigh, moving, _ = double(name)
-    if weigh is not None and name not in OF_ROUNDING:  # The products of JAX's rule for QR state no precision.
-        with jax.enable_x64(True):
-            assert not loose(weigh, moving)
+def test_products_and_those_of_gradients_are_exact_on_gpus(hold, loose):
+    def rule(name):
+        function, arrays, _ = single(name)
+        assert not loose(function, arrays[0])
+        wide = double(name)
+        if wide.program is not None and name not in OF_ROUNDING:  # JAX's rule for QR states no precision of products.
+            with jax.enable_x64(True):
+                assert not loose(wide.program, wide.moving)
+
+    hold(rule, PURE)
 
 
-@pytest.mark.parametrize("name", [name for name in PURE if name in EXAMPLES and name not in OF_ROUNDING])
-def test_float32_as_callers_use_it_equals_float64_under_jit(name, close):
+def test_float32_as_callers_use_it_one_by_one_equals_float64_under_jit_and_vmap(hold, close):
     """Functions that are not compiled whole, but in parts, may look at values or have parts in NumPy without jit."""
-    jax.tree.map(close, single(name)[2], double(name)[0])
+
+    def rule(name):
+        results = single(name)[2]
+        apart = jax.tree.map(lambda *leaf: np.stack(leaf), *results) if is_batched(name) else results[0]
+        jax.tree.map(close, apart, double(name).result)
+
+    hold(rule, [name for name in PURE if name not in OF_ROUNDING])
 
 
-@pytest.mark.parametrize("name", OF_ROUNDING)
-def test_jit_equals_eager_where_results_are_rounding(name, close):
-    _, arrays, compiled = single(name)
-    eager = PUBLIC[name].__wrapped__(*arrays.position, **arrays.name, **EXAMPLES[name].options)
-    jax.tree.map(close, compiled, eager)
+def test_jit_equals_eager_and_vmap_equals_a_loop_where_results_are_rounding(hold, close):
+    def rule(name):
+        function, arrays, results = single(name)
+        eager = PUBLIC[name].__wrapped__(*arrays[0].position, **arrays[0].name, **EXAMPLES[name].options)
+        jax.tree.map(close, results[0], eager)
+        together = jax.jit(jax.vmap(function))(jax.tree.map(lambda *leaf: np.stack(leaf), *arrays))
+        jax.tree.map(close, together, jax.tree.map(lambda *leaf: np.stack(leaf), *results))
+
+    hold(rule, OF_ROUNDING)
 
 
-@each_pure
-def test_float32_in_gives_float32_out(name):
-    _, arrays, result = single(name)
-    _check_dtype(arrays, result, jnp.float32)
+def test_float32_in_gives_float32_out(hold):
+    def rule(name):
+        _, arrays, results = single(name)
+        check_dtype(arrays[0], results[0], jnp.float32)
+
+    hold(rule, PURE)
 
 
-@each_pure
-def test_float64_in_gives_float64_out(name, x64):
-    _check_dtype(build(name), double(name)[0], jnp.float64)
+def test_float64_in_gives_float64_out(hold, x64):
+    hold(lambda name: check_dtype(build(name), double(name).result, jnp.float64), PURE)
 
 
-def _check_dtype(arrays, result, dtype):
+def check_dtype(arrays, result, dtype):
+    """All floating-point arrays of arguments and results have a dtype."""
     assert all(leaf.dtype == dtype for leaf in floats(arrays)), "the example itself must have the dtype"
     result = floats(result)
     assert [leaf.dtype for leaf in result] == [dtype] * len(result)
     assert result, "a function without floating-point results is for HOST"
 
 
-@pytest.mark.parametrize("name", [name for name in TAKING_ARRAYS if EXAMPLES[name].batch])
-def test_vmap_equals_a_loop(name, close):
-    function, first, result = single(name)
-    arrays = [first, *(build(name, seed) for seed in range(1, BATCH))]
-    stacked = jax.tree.map(lambda *leaf: np.stack(leaf), *arrays)
-    together = jax.jit(jax.vmap(lambda arrays: run(name, arrays)))(stacked)
-    apart = jax.tree.map(lambda *leaf: np.stack(leaf), result, *[function(each) for each in arrays[1:]])
-    jax.tree.map(close, together, apart)
+def test_gradient_equals_finite_differences(hold, x64):
+    def rule(name):
+        _, program, moving, gradient = double(name)
+        random = Draw(200)
+        assert program is not None, "no argument holds floating-point arrays: say gradient=()"
+        for key, slope in gradient.items():
+            direction = jax.tree.map(lambda leaf: random.normal(*leaf.shape), moving[key])
+            norm = np.sqrt(sum(summed(name, np.square(leaf)) for leaf in floats(slope)))
+            assert np.isfinite(norm).all(), f"the gradient in {key} is not finite"
+            assert norm.all(), f"the gradient in {key} is zero: not what an example is for"
+            products = jax.tree.map(lambda *pair: summed(name, np.multiply(*pair)), floats(slope), floats(direction))
+            ahead, back = (program(moving | {key: moved(moving[key], direction, step)}) for step in (STEP, -STEP))
+            numeric = (ahead - back) / (2 * STEP)
+            assert (abs(sum(products) - numeric) <= GRADIENT_TOLERANCE * norm).all(), (
+                f"in {key}: {sum(products)}, differences {numeric}"
+            )
+
+    hold(rule, [name for name in TAKING_ARRAYS if EXAMPLES[name].gradient != ()])
 
 
-@pytest.mark.parametrize("name", [name for name in TAKING_ARRAYS if EXAMPLES[name].gradient != ()])
-def test_gradient_equals_finite_differences(name, x64):
-    _, weigh, moving, gradient = double(name)
-    random = Draw(200)
-    assert weigh is not None, "no argument holds floating-point arrays: say gradient=()"
-    for key, slope in gradient.items():
-        direction = jax.tree.map(lambda leaf: random.normal(*leaf.shape), moving[key])
-        norm = np.sqrt(sum(np.sum(np.square(leaf)) for leaf in floats(slope)))
-        assert np.isfinite(norm), f"the gradient in {key} is not finite"
-        assert norm > 0, f"the gradient in {key} is zero: not what an example is for"
-        analytic = sum(np.vdot(*pair) for pair in zip(floats(slope), floats(direction), strict=True))
-        ahead, back = (weigh(moving | {key: _moved(moving[key], direction, step)}) for step in (STEP, -STEP))
-        numeric = (ahead - back) / (2 * STEP)
-        assert abs(analytic - numeric) <= GRADIENT_TOLERANCE * norm, f"in {key}: {analytic}, differences {numeric}"
+def summed(name: str, value: Any) -> np.ndarray:
+    """Sums over the elements of each set of arguments."""
+    value = np.asarray(value)
+    return np.sum(value, axis=tuple(range(int(is_batched(name)), value.ndim)))
 
 
-def _moved(tree, direction, step):
+def moved(tree, direction, step):
+    """The arrays a step further along a direction."""
     return jax.tree.map(lambda leaf, along: np.asarray(leaf) + step * np.asarray(along), tree, direction)
