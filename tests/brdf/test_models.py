@@ -393,17 +393,6 @@ def _check_finite(model):
             assert np.all(np.isfinite(np.asarray(leaf))), case
 
 
-def test_parameter_gradient_equals_finite_difference(x64):
-    wi, wo = (jnp.asarray(w, jnp.float64) for w in _pairs(50))
-
-    def total(nu):
-        return jnp.sum(evaluate(AshikhminShirley(diffuse=0.5, specular=0.75, nu=nu, nv=100.0), wi, wo))
-
-    step = 1e-4
-    expected = (total(10 + step) - total(10 - step)) / (2 * step)
-    assert jax.grad(total)(10.0) == pytest.approx(float(expected), rel=1e-6)
-
-
 @pytest.mark.parametrize("name", ISOTROPIC)
 def test_isotropic_models_know_no_tangent(name, x64, close):
     wi, wo = _pairs()

@@ -36,13 +36,8 @@ def test_relative_l2_of_two_black_images_is_zero_and_of_light_against_black_infi
     assert metrics.relative_l2(black, image) == 1
 
 
-def test_the_gradient_of_relative_l2_equals_finite_differences_and_is_zero_at_equality():
-    image, reference = _pair()
-    direction = jnp.asarray(np.random.default_rng(1).standard_normal(image.shape), jnp.float32)
-    slope = jnp.vdot(jax.grad(metrics.relative_l2)(image, reference), direction)
-    high = metrics.relative_l2(image + 1e-3 * direction, reference)
-    low = metrics.relative_l2(image - 1e-3 * direction, reference)
-    assert slope == pytest.approx(float(high - low) / 2e-3, rel=2e-2, abs=1e-4)
+def test_the_gradient_of_relative_l2_is_zero_at_equality():
+    image, _ = _pair()
     np.testing.assert_array_equal(jax.grad(metrics.relative_l2)(image, image), 0)
     np.testing.assert_array_equal(jax.grad(metrics.relative_l2)(0 * image, 0 * image), 0)
 

@@ -272,18 +272,6 @@ def _scene():
     return mesh, color, _camera(eye=(0, 2, 2))
 
 
-def test_the_gradient_of_render_in_color_and_background_equals_finite_differences():
-    mesh, color, camera = _scene()
-    rng = np.random.default_rng(1)
-    background, weight, other = jnp.asarray(rng.random((3, camera.height, camera.width, 3)), jnp.float32)
-    step = jnp.asarray(rng.standard_normal(color.shape), jnp.float32)
-    value = jax.jit(lambda c, b: jnp.vdot(weight, pixels.render(mesh, c, camera, background=b)))
-    slope = jax.grad(value, argnums=(0, 1))(color, background)
-    start = float(value(color, background))  # The value is linear, so that a large step is exact.
-    assert jnp.vdot(slope[0], step) == pytest.approx(float(value(color + step, background)) - start, rel=2e-3)
-    assert jnp.vdot(slope[1], other) == pytest.approx(float(value(color, background + other)) - start, rel=2e-3)
-
-
 def test_the_derivative_of_interpolate_in_color_is_the_transpose_of_its_value():
     mesh, color, camera = _scene()
     fragments = raster.rasterize(mesh, camera)

@@ -241,21 +241,6 @@ def test_texels_in_any_order_and_twice_over_add_up(transport, sky, close):
     close(bright_texels.radiance(transport, GLOSSY, same, jnp.tile(excess[:1] / COUNT, (COUNT, 1)), eye=EYE), once)
 
 
-def test_eyes_below_the_horizon_see_what_grazing_eyes_see(transport, sky, close):
-    texel, excess, _ = bright_texels.split(sky, count=COUNT)
-    lit = np.flatnonzero(np.asarray(bright_texels.irradiance(transport, texel, excess)).any(1))
-    for vertex in lit[:3]:
-        tangent, _, normal = transport.frame[vertex]
-        beneath, grazing = (
-            bright_texels.radiance(
-                transport, GLOSSY, texel, excess, eye=transport.position[vertex] + tangent + height * normal
-            )
-            for height in (-3, 0.005)
-        )
-        close(beneath[vertex], grazing[vertex])
-        assert np.asarray(beneath[vertex]).any()
-
-
 @pytest.mark.parametrize("place", ["on a vertex", "far away", "in the plane"])
 def test_eyes_in_odd_places_have_finite_radiance_and_slopes(transport, sky, place):
     texel, excess, _ = bright_texels.split(sky, count=COUNT)

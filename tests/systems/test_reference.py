@@ -147,6 +147,12 @@ def test_eyes_below_the_horizon_see_what_grazing_eyes_see(random, close):
         close(beneath[vertex], grazing[vertex])
 
 
+def test_eyes_in_odd_places_give_finite_radiance(mesh, random):
+    for eye in (mesh.position[7], [0, 0, 0], [0.3, -0.2, 0.4], [1e15, 1e15, -1e15], mesh.position[7] * (1 + 1e-6)):
+        color = reference.radiance(mesh, GLOSSY, some_light(random), eye=jnp.asarray(eye, jnp.float32))
+        assert np.isfinite(color).all()
+
+
 def test_gray_brdfs_and_gray_lights_give_what_their_colors_would(random, close):
     arrays, light = hemisphere(random, 3), some_light(random)
     close(

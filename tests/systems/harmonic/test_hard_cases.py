@@ -178,12 +178,6 @@ def test_a_lone_triangle_has_nothing_to_bounce(lambert):
     np.testing.assert_array_equal(same.matrix, transport.matrix)
 
 
-def test_no_light_gives_no_radiance(lambert, mirror):
-    transport = precompute(scene(), size=8, progress=False)
-    for table in (lambert, mirror):
-        assert not np.asarray(harmonic.radiance(transport, table, jnp.zeros((25, 3)), eye=EYE)).any()
-
-
 def negative(coefficient):
     """Share of the absolute light that is negative, and the lowest over the highest value."""
     value = np.asarray(harmonics.reconstruct(coefficient, cubemap.direction(size=32)))[..., 0]
@@ -240,14 +234,6 @@ def test_diffuse_surfaces_under_a_sun_hardly_ring(lambert):
     assert color.min() > -0.06 * exact.max()
 
 
-@pytest.mark.parametrize("strength", [1e-25, 1.0, 1e25])
-def test_the_strength_of_the_light_does_not_matter(lambert, close, strength):
-    light = harmonic.project(sun(), degree=4)
-    expected = harmonic.unshadowed_radiance(sphere(), lambert, light, eye=EYE)
-    actual = harmonic.unshadowed_radiance(sphere(), lambert, light * strength, eye=EYE)
-    close(np.asarray(actual) / np.float32(strength), expected)
-
-
 @pytest.mark.parametrize("roughness", [0.1, 0.03, 0.01, 0.003])
 def test_mirror_like_brdfs_are_tabulated_as_the_harmonics_in_the_mirror_direction(roughness):
     """The narrower a lobe, the more its coefficients are those of a point, times what it reflects."""
@@ -277,16 +263,6 @@ def test_mirrors_show_the_light_itself(mirror, close):
     away = directions.normalize(EYE - mesh.position)
     mirrored = 2 * jnp.sum(away * mesh.normal, -1, keepdims=True) * mesh.normal - away
     close(color, harmonics.reconstruct(light, mirrored), tolerance=DEEP)
-
-
-def test_eyes_in_odd_places_give_finite_radiance(lambert, mirror):
-    mesh, light = sphere(), harmonic.project(sun(), degree=4)
-    transport = precompute(mesh, size=8, progress=False)
-    places = (mesh.position[7], jnp.zeros(3), jnp.array([1e15, 1e15, -1e15]), mesh.position[7] * (1 + 1e-6))
-    for table in (lambert, mirror):
-        for eye in places:
-            color = np.asarray(harmonic.radiance(transport, table, light, eye=eye))
-            assert np.isfinite(color).all()
 
 
 def test_views_below_the_horizon_see_what_grazing_views_see_with_and_without_transfer(lambert):

@@ -168,14 +168,6 @@ def test_gray_is_three_equal_colors(random, close):
                 close(actual, jnp.repeat(gray, actual.shape[1], 1))
 
 
-def test_radiance_is_linear_in_light_and_table(random, close):
-    matrix, brdf = made(random)
-    first, second = normal(random, 9, 3), normal(random, 9, 3)
-    whole = harmonic.radiance(matrix, brdf, 2 * first - 3 * second, eye=EYE)
-    part = [harmonic.radiance(matrix, brdf, each, eye=EYE) for each in (first, second)]
-    close(whole, 2 * part[0] - 3 * part[1])
-
-
 def test_smooth_light_without_shadows_is_that_of_the_reference(light, coefficient, glossy):
     mesh = builtin.sphere(rings=6, sectors=10)
     for table, brdf in ((glossy, Phong(diffuse=ALBEDO, specular=[0.1, 0.3, 0.1], exponent=6.0)),):

@@ -135,13 +135,6 @@ def test_constant_light_stays_constant_at_all_scales(close):
     close(filtered.pyramid, np.full(filtered.pyramid.shape, 2.5))
 
 
-def test_radiance_is_linear_in_the_light(transport, tables, light, close):
-    other = Environment(light.radiance[:, ::-1] ** 2)
-    both = Environment(2 * light.radiance + 3 * other.radiance)
-    one, two, three = (np.asarray(lobe.radiance(transport, tables["sharp"], x, eye=EYE)) for x in (light, other, both))
-    close(three, 2 * one + 3 * two)
-
-
 def test_a_gray_light_on_a_colored_brdf_and_the_other_way_round(transport, tables, light, close):
     gray = Environment(jnp.mean(light.radiance, -1, keepdims=True))
     colored = Environment(jnp.repeat(gray.radiance, 3, -1))
@@ -149,42 +142,6 @@ def test_a_gray_light_on_a_colored_brdf_and_the_other_way_round(transport, table
         color = lobe.radiance(transport, tables[name], gray, eye=EYE)
         expected = lobe.radiance(transport, tables[name], colored, eye=EYE)
         close(np.broadcast_to(color, expected.shape), expected)
-
-
-def test_the_halves_are_the_whole(transport, tables, light, close):
-    filtered, view = lobe.prefilter(light), lobe.view_lobes(transport, tables["brushed"], eye=EYE)
-    close(lobe.combine(filtered, view), lobe.radiance(transport, tables["brushed"], light, eye=EYE))
-
-
-def test_gradients_by_light_eye_and_table_are_finite_differences(transport, tables, light):
-    table = tables["sharp"]
-
-    def loss(light, table, eye):
-        return jnp.mean(lobe.radiance(transport, table, light, eye=eye) ** 2)
-
-    gradient = jax.grad(loss, argnums=(0, 1, 2), allow_int=True)(light, table, EYE)
-    step = 1e-2
-    by_light = (
-        loss(Environment(light.radiance * (1 + step)), table, EYE)
-        - loss(Environment(light.radiance * (1 - step)), table, EYE)
-    ) / (2 * step)
-    np.testing.assert_allclose(jnp.sum(gradient[0].radiance * light.radiance), by_light, rtol=2e-3)
-    weights = [
-        lobe.LobeBrdf(table.mean, table.scale, table.weight * (1 + x), table.diffuse, (), table.error)
-        for x in (step, -step)
-    ]
-    by_weight = (loss(light, weights[0], EYE) - loss(light, weights[1], EYE)) / (2 * step)
-    np.testing.assert_allclose(jnp.sum(gradient[1].weight * table.weight), by_weight, rtol=2e-3)
-    assert np.isfinite(gradient[2]).all()
-    assert np.abs(gradient[2]).max() > 0
-
-
-def test_a_light_of_another_size_is_refused(transport, tables):
-    with pytest.raises(
-        ValueError,
-        match=r"(environment .6, 16, 16, c., got .6, 32, 32, 3.|along an edge as the transport.s, 16, got 32)",
-    ):
-        lobe.radiance(transport, tables["matte"], Environment(np.ones((6, 32, 32, 3), np.float32)), eye=EYE)
 
 
 def test_a_batch_of_lights_is_refused(light, unchecked):

@@ -231,22 +231,6 @@ def test_in_float64_only_what_is_stored_is_rounded(small, random, close, x64):
     close(value, np.einsum("vdr,dc->vrc", by_vertex(small), light))
 
 
-def test_slopes_of_radiance_by_the_light_are_radiance_itself(small, brdf, random, close):
-    """Radiance is linear: <w, radiance(d)> is the slope of <w, radiance(light)> along d."""
-    light = builtin.daylight(size=SIZE)
-    weight = random.normal(size=(VERTICES, 3))
-
-    def seen_by_all(light):
-        return jnp.vdot(jnp.asarray(weight, jnp.float32), separable.radiance(small, brdf, light, eye=EYE))
-
-    slope = jax.grad(seen_by_all)(light).radiance
-    for _ in range(3):
-        along = random.normal(size=(6, SIZE, SIZE, 3)).astype(np.float32)
-        moved = separable.radiance(small, brdf, eqx.tree_at(lambda x: x.radiance, light, along), eye=EYE)
-        scale = np.linalg.norm(slope) * np.linalg.norm(along)
-        assert abs(np.vdot(slope, along) - np.vdot(weight, moved)) < 1e-5 * scale
-
-
 def test_slopes_by_stored_numbers_are_finite(small, brdf):
     light = builtin.daylight(size=SIZE)
 

@@ -4,7 +4,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import trimesh
 
 import jaxprt as prt
 from jaxprt import bright_texels, reference, separable
@@ -93,11 +92,6 @@ def test_a_sun_in_one_texel_is_that_of_the_reference(lambert, strength):
     np.testing.assert_allclose(color / strength, exact / strength, atol=1e-5)
 
 
-def test_no_light_gives_no_radiance(lambert, glossy):
-    for brdf in (lambert, glossy):
-        assert not relight(sphere(), brdf, Environment(jnp.zeros((6, SIZE, SIZE, 3)))).any()
-
-
 def test_an_image_of_one_pixel_is_constant_light(lambert):
     light = environment_from_image(np.full((1, 1, 3), 2, np.float32), size=SIZE)
     color = relight(sphere(), lambert, light, keep=ALL)
@@ -136,31 +130,6 @@ def test_the_error_falls_as_more_is_kept(lambert, light):
     assert error[3] < EXACT
 
 
-def test_grazing_eyes_give_finite_radiance(lambert, glossy, light):
-    plane = builtin.plane(cells=2)
-    for height in (1e-30, 1e-6, 1e-3, 0.0, -1e-6):
-        for brdf in (lambert, glossy):
-            color = relight(plane, brdf, light, eye=jnp.array([50.0, height, 3.0]))
-            assert np.isfinite(color).all()
-            assert color.any()
-
-
-@pytest.mark.parametrize("place", ["vertex", "center", "inside", "far away", "just off"])
-def test_eyes_in_odd_places_give_finite_radiance(lambert, glossy, light, place):
-    mesh = sphere()
-    eye = {
-        "vertex": mesh.position[7],
-        "center": jnp.zeros(3),
-        "inside": jnp.array([0.3, -0.2, 0.4]),
-        "far away": jnp.array([1e15, 1e15, -1e15]),
-        "just off": mesh.position[7] * (1 + 1e-6),
-    }[place]
-    for brdf in (lambert, glossy):
-        color = relight(mesh, brdf, light, eye=eye)
-        assert np.isfinite(color).all()
-    assert np.isfinite(exact_radiance(mesh, AshikhminShirley(), light, eye=eye, error=0.01)).all()
-
-
 def test_one_triangle_is_lit_from_its_front(lambert, light):
     mesh = make_mesh(np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0.0]]), np.array([[0, 1, 2]]))
     color = relight(mesh, lambert, light, keep=ALL)
@@ -189,13 +158,6 @@ def test_size_does_not_matter(lambert, light, close, scale):
     expected = relight(mesh, lambert, light, keep=ALL)
     # Rays that pass an edge closer than float32 tells may fall on its other side: a sixteenth of a few texels.
     close(relight(moved(mesh, scale=scale), lambert, light, keep=ALL, eye=EYE * scale), expected, tolerance=0.01)
-
-
-def test_the_inside_of_a_closed_box_is_dark(lambert, glossy, light):
-    box = trimesh.creation.box()
-    inward = make_mesh(np.array(box.vertices), np.array(box.faces)[:, ::-1])
-    for brdf in (lambert, glossy):
-        assert not relight(inward, brdf, light, eye=jnp.array([0.1, 0.05, -0.1])).any()
 
 
 def test_what_touches_the_ground_is_not_lit_from_beneath(lambert):
