@@ -171,7 +171,7 @@ def judged(
     whole: RelitScene, triples: list[Triple], sizes: Sizes, folder: pathlib.Path | None, keep: pathlib.Path | None
 ) -> dict:
     """Medians over some triples."""
-    direct = whole.direct
+    direct = whole.without_bounces()
     first = triples[0]
     timing = harness.measure(
         lambda: whole.picture(first.light, first.camera, materials=first.materials, samples=FINAL), repeats=3

@@ -138,7 +138,7 @@ def reflected(name: str, scene: Scene, quick: bool, store: pathlib.Path | None, 
     size, lobes = next(iter(given.values())).radiance.shape[-2], Lobes(lobes=3, texels=4) if quick else Lobes()
     path = store and store / file_name(name, "lobe")
     whole = precompute(scene, refine=False, system=lobes, bounces=BOUNCES, size=size, path=path, progress=False)
-    direct = whole.direct
+    direct = whole.without_bounces()
     for light_name, light in given.items():
         judge = Judge(scene, light, camera, 16 if quick else SAMPLES, bounces=BOUNCES)
         for system, each in {"lobe, 2 bounces": whole, "lobe, no bounces": direct}.items():

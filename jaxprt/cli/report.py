@@ -18,13 +18,15 @@ from jaxtyping import Array
 from jaxprt import files, image, relit, visibility
 from jaxprt.files import objects
 from jaxprt.image import layers
-from jaxprt.relit import regions
+from jaxprt.relit import measuring, regions
 from jaxprt.relit.channels import Shading, of_part
 from jaxprt.relit.exact import ExactPicture, ExactPixels, exact_picture, exact_pixels
+from jaxprt.relit.exact_lamps import Lamps
 from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.recipes import Known, Recipe, Target, harmonic_table
 from jaxprt.relit.regions import RegionsView
 from jaxprt.scene import Camera, Environment, Mesh, Scene, sides
+from jaxprt.scene.scene import centered
 from jaxprt.systems import harmonic, protocol, reference
 from jaxprt.systems.harmonic import HarmonicSystem, TransferMatrix
 from jaxprt.systems.protocol import Blend, System
@@ -161,7 +163,7 @@ def _made(view: View, output: Path, **options: Any) -> Made:
         ready = relit.precompute(view.scene, refine=False, path=output, **options)
     except ValueError as error:
         raise ValueError(f"{error}; on the command line, name another --output" if found else str(error)) from error
-    direct = ready.direct
+    direct = ready.without_bounces()
     cost = {"seconds": timeit.default_timer() - start, "bytes": ready.nbytes}
     return Made(direct, direct if ready.bounces is None else ready, direct.mesh, None, cost)
 
@@ -201,12 +203,13 @@ def exact_vertices(view: View, vertices: list[np.ndarray]) -> list[np.ndarray]:
     """Exact radiance of some vertices of the first parts, [light v c]."""
     lights = Environment(jnp.stack([each.radiance for each in view.lights.values()]))
     options = {"eye": view.camera.eye, "occluder": view.scene.mesh, "progress": True}
-    result = []
-    for part, vertex in zip(view.scene.parts, vertices, strict=False):
-        shading = of_part(part)
-        result.append(np.asarray(reference.radiance(shading.mesh, shading.exact, lights, vertex=vertex, **options)))
-        if shading.emitted is not None:
-            result[-1] = result[-1] + np.asarray(shading.emitted)[vertex]
+    result, shadings = [], [of_part(part) for part in view.scene.parts]
+    lamps = Lamps.of(centered(view.scene), shadings)
+    eye = view.camera.local(view.scene.mesh.origin).eye
+    for shading, vertex in zip(shadings, vertices, strict=False):
+        color = np.asarray(reference.radiance(shading.mesh, shading.exact, lights, vertex=vertex, **options))
+        color = color + lamps.at_vertices(shading.mesh, measuring.exact_brdf(shading, vertex), vertex, eye)
+        result.append(color if shading.emitted is None else color + np.asarray(shading.emitted)[vertex])
     return result
 
 

@@ -1,4 +1,7 @@
-"""Reference pictures in direct light, by the sum over all texels: some pixels to measure errors, or a whole picture."""
+"""Reference pictures in direct light: some pixels to measure errors, or a whole picture.
+
+The light of the environment is the sum over all its texels, that of lamps the sum over random places on them.
+"""
 
 import dataclasses
 import math
@@ -18,6 +21,7 @@ from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import Between, finished
 from jaxprt.image import Pixels, front, raster, relative_l2, resolve, skies
 from jaxprt.image.layers import nearest_fragments, visible_points
+from jaxprt.relit import exact_lamps
 from jaxprt.relit.channels import Shading, at_points, exact_at
 from jaxprt.scene import Camera, Environment, Mesh, Scene, environment, sides
 from jaxprt.scene.points import Points, on_triangles
@@ -118,6 +122,7 @@ def exact_pixels(
     angle = _squares(skies.pixel_angle(fine))[pixel]
     behind = np.stack([environment.sky(each, way, angle=angle) for each in environments])
     mean = np.where((owner < 0)[..., None], behind, 0).mean(2)
+    lamps = exact_lamps.Lamps.of(scene, shadings)
     half = np.zeros_like(mean)
     first = 0
     for number, (part, shading) in enumerate(zip(scene.parts, shadings, strict=True)):
@@ -131,6 +136,7 @@ def exact_pixels(
         brdf, emitted, where = exact_at(part, shading, where)
         options = {"eye": camera.eye, "occluder": mesh, "progress": progress, "between": between}
         value = _sum(shading.mesh, brdf, lights, where, **options).astype(np.float64)
+        value = value + lamps.at_points(shading.mesh, brdf, where, jnp.asarray(camera.eye))
         value = value if emitted is None else value + np.asarray(emitted)
         share = own.mean(1)[:, None]
         half_of = _halves(row, place)
@@ -176,7 +182,9 @@ def exact_picture(
     asked, (scene, camera) = camera, _near(scene, camera)
     shown = finished(_Shown.of(scene, camera), between)
     tilted = [getattr(part.material, "normal_texture", None) is not None for part in scene.parts]
-    smooth = [_is_smooth(each, shown, number) and not tilted[number] for number, each in enumerate(shadings)]
+    lamps = exact_lamps.Lamps.of(scene, shadings)
+    interpolated = [not lamps.lamp and not normal_map for normal_map in tilted]
+    smooth = [_is_smooth(each, shown, number) and interpolated[number] for number, each in enumerate(shadings)]
     count = sum(np.count_nonzero(shown.owner == number) for number, each in enumerate(smooth) if not each)
     if count > most:
         step = math.ceil(math.sqrt(count / most))
@@ -201,6 +209,7 @@ def exact_picture(
         else:
             brdf, emitted, points = exact_at(part, shading, points)
             value = _sum(shading.mesh, brdf, lights, points, **options)
+            value = value + lamps.at_points(shading.mesh, brdf, points, jnp.asarray(camera.eye))
         color[:, index] = value if emitted is None else value + emitted
     behind = [skies.sky(each, camera) for each in environments]
     pictures = [resolve(shown.pixels, a, background=b) for a, b in zip(color, behind, strict=True)]

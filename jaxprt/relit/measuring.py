@@ -18,9 +18,11 @@ from jaxprt.brdf.varying import PerVertex
 from jaxprt.relit import refinement
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.exact import exact_pixels
+from jaxprt.relit.exact_lamps import Lamps
 from jaxprt.scene import Environment, Mesh, Scene, builtin
 from jaxprt.scene.camera import orbit
 from jaxprt.scene.mesh import bounds
+from jaxprt.scene.scene import centered
 from jaxprt.systems import protocol, reference
 
 JUDGED = 1350  # number of points, of all parts together, whose exact radiance is computed
@@ -94,7 +96,8 @@ def measure(scene: Any, environments: Sequence[Environment]) -> Report:
         environments: Environments of one size.
     """
     size, mesh, shadings = checked(environments, 1.0, 1.0), scene.mesh, scene.shading
-    direct, views = scene.direct, views_around(mesh)
+    lamps = Lamps.of(centered(scene.scene), shadings)
+    direct, views = scene.without_bounces(), views_around(mesh)
     seen = [direct.view(jnp.asarray(eye)) for eye in views]
     lit = [direct.shade(direct.light(each)) for each in environments]
     color = np.stack([[np.asarray(direct.combine(light, view)) for view in seen] for light in lit])
@@ -106,7 +109,10 @@ def measure(scene: Any, environments: Sequence[Environment]) -> Report:
         vertex = np.sort(np.random.default_rng(1).permutation(count)[:few])
         visible = visibility.precompute(shading.mesh, size=size, occluder=mesh, vertex=vertex, progress=False)
         judged = np.arange(len(vertex))
-        exact = _exact(visible, judged, _exact_brdf(shading, vertex), environments, views)
+        brdf = exact_brdf(shading, vertex)
+        exact = _exact(visible, judged, brdf, environments, views)
+        if lamps.lamp:
+            exact += np.stack([lamps.at_vertices(shading.mesh, brdf, vertex, jnp.asarray(eye)) for eye in views])
         facing, now = _facing(visible, judged, views), color[:, :, first + vertex]
         if shading.emitted is not None:
             now = now - np.asarray(shading.emitted)[vertex]
@@ -197,7 +203,7 @@ def relative_error(now: np.ndarray, exact: np.ndarray) -> float:
     return float(np.nan_to_num(wrong, nan=np.inf)) / (whole if whole > 0 else 1.0)
 
 
-def _exact_brdf(shading: Shading, vertex: np.ndarray) -> Callable:
+def exact_brdf(shading: Shading, vertex: np.ndarray) -> Callable:
     """The exact BRDF of some vertices."""
     exact = shading.exact
     return PerVertex(exact.of(jnp.asarray(vertex))) if isinstance(exact, PerVertex) else grid.as_argument(exact)

@@ -199,12 +199,6 @@ class RelitScene(System):
         source = np.concatenate([np.arange(count), copies])
         return jax.tree.map(lambda leaf: jnp.asarray(subdivision.spread(leaf[source], parents)), given)
 
-    @property
-    def direct(self) -> "RelitScene":
-        """The scene in direct light of the environment only, without bounces and lamps."""
-        surfaces = tuple(dataclasses.replace(own, lit=None) for own in self.surfaces)
-        return self._replaced(surfaces=surfaces, lamps=None).without_bounces()
-
     def without_bounces(self) -> "RelitScene":
         """The scene without light that its parts reflect onto each other."""
         surfaces = tuple(dataclasses.replace(own, reflecting=None) for own in self.surfaces)

@@ -41,9 +41,7 @@ class Stages:
         systems = {name: scene.centered() for name, scene in systems.items()}
         self.systems = systems
         self.name, self.lights = list(environments), list(environments.values())
-        # Scenes without bounces; and without lamps too, to compare with exact pictures.
-        self._bare = {name: each.without_bounces() for name, each in systems.items()}
-        self._direct = {name: each.direct for name, each in systems.items()}
+        self._bare = {name: scene.without_bounces() for name, scene in systems.items()}
         self._kept: dict[str, OrderedDict[Hashable, Any]] = {}
         self._lock = threading.Lock()
 
@@ -157,7 +155,7 @@ class Stages:
     def direct_picture(self, look: Look, width: int, height: int, *, between: Between) -> Float[np.ndarray, "h w 3"]:
         """The picture under direct light of the environment only."""
         given = self.environment(look), camera(look, width, height)
-        found = self._direct[look.system].picture(*given, materials=self.materials(look), between=between)
+        found = self._bare[look.system].picture(*given, materials=self.materials(look), between=between)
         return np.broadcast_to(np.asarray(found), (height, width, 3))
 
     def changed_scene(self, look: Look) -> Scene:

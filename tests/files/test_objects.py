@@ -25,7 +25,9 @@ from jaxprt.sphere import hemisphere
 
 # Host records of the command line, of reports, of files that are read, and libraries; no user saves them.
 UNSAVED = {"jaxprt.cli.report", "jaxprt.cli.animation", "jaxprt.__main__", "jaxprt.view.piece", "jaxprt.view.messages"}
-UNSAVED |= {f"jaxprt.scene.formats.{name}" for name in ("geometry", "gltf_file", "gltf_geometry", "gltf_nodes", "ply", "text")}
+UNSAVED |= {
+    f"jaxprt.scene.formats.{name}" for name in ("geometry", "gltf_file", "gltf_geometry", "gltf_nodes", "ply", "text")
+}
 UNSAVED |= {"jaxprt.visibility.packets"}
 
 

@@ -10,7 +10,8 @@ import pytest
 import jaxprt as prt
 from jaxprt import lobe
 from jaxprt.brdf import Lambert
-from jaxprt.relit import Harmonics, RelitScene, probes
+from jaxprt.relit import Harmonics, RelitScene, exact_lamps, probes
+from jaxprt.relit.channels import of_part
 from jaxprt.scene import Camera, Environment, Part, PointLight, Scene, TexturedMaterial, builtin
 from jaxprt.scene.environment import background
 from jaxprt.scene.mesh import make_mesh
@@ -202,3 +203,31 @@ def test_what_was_not_precomputed_is_refused():
             relit().radiance(DARK, eye=EYE, materials=materials)
     with pytest.raises(ValueError, match="several named"):
         Scene(scene().parts, point_lights=[PointLight("floor", [0, 1, 0])])
+
+
+def test_reference_light_of_lamps_has_its_closed_forms():
+    """Below the middle of a square lamp (Howell's configuration factor B-4, four times), and below a point light."""
+    square, height = np.array([[-1, 1, -1], [1, 1, -1], [1, 1, 1], [-1, 1, 1]], float) * [0.4, 0.6, 0.4], 0.6
+    panel = make_mesh(square, np.array([[0, 1, 2], [0, 2, 3]]))  # its normals point down
+    matte = TexturedMaterial(base_color=0.5, metallic=0.0, specular=0.0)
+    parts = [Part("floor", PLANE, matte), Part("panel", panel, TexturedMaterial(**BLACK, emissive=WARM))]
+    bulb = PointLight("bulb", [0.0, 0.3, 0.0], 2.0)
+    middle, eye = np.array([12]), jnp.array([0.5, 1.0, 0.2])
+    np.testing.assert_allclose(PLANE.position[12], 0, atol=1e-6)
+
+    def color(*part, **lights):
+        case = Scene(part, **lights)
+        shadings = [of_part(each) for each in case.parts]
+        return exact_lamps.Lamps.of(case, shadings).at_vertices(PLANE, Lambert(0.5), middle, eye)[0]
+
+    side = 0.4 / np.hypot(0.4, height)
+    factor = 4 / np.pi * side * np.arctan(side)
+    np.testing.assert_allclose(color(*parts), 0.5 * factor * np.array(WARM), rtol=5e-3)
+    np.testing.assert_allclose(color(parts[0], point_lights=[bulb]), 0.5 / np.pi * 2 / 0.3**2, rtol=1e-3)
+
+
+def test_reports_measure_lamps_too():
+    """Parts that only lamps light have an error, which is that of the lamps."""
+    report = relit().report([DARK])
+    assert 0 < report.part[0].errors[0] < 0.2
+    assert 0 < report.part[0].vertex_errors[0] < 0.2

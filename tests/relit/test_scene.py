@@ -261,12 +261,12 @@ def reflecting():
 
 
 def test_bounces_are_added_to_direct_light(reflecting):
-    direct, whole = (each.radiance(light(), eye=EYE) for each in (reflecting.direct, reflecting))
+    direct, whole = (each.radiance(light(), eye=EYE) for each in (reflecting.without_bounces(), reflecting))
     reflected = whole - direct
     assert float(jnp.min(reflected)) > -1e-3
     np.testing.assert_allclose(direct, relit("harmonic").radiance(light(), eye=EYE), rtol=1e-4, atol=1e-5)
     assert 0.02 < np.linalg.norm(reflected) / np.linalg.norm(direct) < 0.5
-    assert reflecting.nbytes > reflecting.direct.nbytes
+    assert reflecting.nbytes > reflecting.without_bounces().nbytes
 
 
 def test_lights_of_small_faces_have_bounces(monkeypatch):
@@ -276,7 +276,7 @@ def test_lights_of_small_faces_have_bounces(monkeypatch):
     parts = [Part("floor", mesh("floor"), Lambert(0.7)), Part("wall", mesh("wall"), Lambert(0.5))]
     ready = prt.precompute(Scene(parts), refine=False, system=RECIPES["harmonic"], bounces=1, size=4, progress=False)
     sky = Environment(jnp.ones((6, 4, 4, 3)))
-    whole, direct = (np.asarray(prt.radiance(each, sky, eye=EYE)) for each in (ready, ready.direct))
+    whole, direct = (np.asarray(prt.radiance(each, sky, eye=EYE)) for each in (ready, ready.without_bounces()))
     assert np.isfinite(whole).all()
     assert 1.05 < whole.sum() / direct.sum() < 1.5
 
@@ -331,7 +331,7 @@ def test_two_bounces_go_on_from_the_store_of_one(tmp_path, monkeypatch):
     def reflected(count):
         options = {"system": RECIPES["harmonic"], "size": SIZE, "path": tmp_path / "store", "progress": False}
         ready = prt.precompute(scene(), refine=False, bounces=count, **options)
-        return ready.radiance(light(), eye=EYE) - ready.direct.radiance(light(), eye=EYE)
+        return ready.radiance(light(), eye=EYE) - ready.without_bounces().radiance(light(), eye=EYE)
 
     once = reflected(1)
     stage, done = visibility.blocks.compute, []

@@ -83,7 +83,7 @@ def test_an_exponent_sharper_than_the_standard_tables_has_a_table_of_its_own():
 def test_a_bounce_carries_the_changed_colors(light):
     system = prt.relit.Lobes(texels=2)
     made = prt.precompute(scene(FIRST), refine=False, system=system, bounces=1, size=SIZE, progress=False)
-    bare = made.direct
+    bare = made.without_bounces()
     first = len(made.scene["ball"].mesh.position)
     eye = made.camera.eye
 

@@ -188,7 +188,7 @@ def test_what_reflects_nothing_but_the_sky_shows_no_rays(close):
     view = ready.view(EYE)
     assert view.reflected is not None
     assert view.reflected.hit == ()
-    direct = ready.direct.radiance(light(), eye=EYE)
+    direct = ready.without_bounces().radiance(light(), eye=EYE)
     seen = np.asarray(facing(ready.mesh, EYE)) > 0
     assert 0.3 < seen.mean() < 0.8
     # Beside it harmonics ring.

@@ -97,7 +97,7 @@ def drawn(hand, systems, lights, shadows="rays"):
     state, camera = hand.state(), hand.camera()
     scene = systems[state["system"]]
     if not state["bounces"]:
-        scene = prt.RelitScene(scene.scene, scene.direct, scene.shading)
+        scene = prt.RelitScene(scene.scene, scene.without_bounces(), scene.shading)
     c, s = np.cos(state["turn"]), np.sin(state["turn"])
     light = rotate(list(lights.values())[state["light"]], np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]))
     height, width = hand.pixels().shape[:2]

@@ -70,7 +70,7 @@ def test_a_look_is_the_radiance_of_its_state(session, systems, lights, look, sys
     look |= {"system": system, "bounces": bounces, "turn": 0.7, "eye": [1.0, 2.0, 3.0]}
     scene = systems[system]
     if not bounces:
-        scene = scene.direct
+        scene = scene.without_bounces()
     expected = scene.radiance(rotate(lights["lamp"], turned(0.7)), eye=jnp.array([1.0, 2.0, 3.0]))
     near(halves(session.answer(look)), expected)
 
@@ -85,7 +85,9 @@ def test_materials_of_a_look_are_those_of_the_scene_with_them(session, systems, 
         base_color=jnp.array([0.1, 0.2, 0.3]),
         specular_color=jnp.array([1, 0.5, 0.2]) * 0.5 / 0.04,
     )
-    near(halves(session.answer(look)), scene.direct.radiance(lights["lamp"], eye=EYE, materials={"ball": new}))
+    near(
+        halves(session.answer(look)), scene.without_bounces().radiance(lights["lamp"], eye=EYE, materials={"ball": new})
+    )
 
 
 def test_a_light_that_turns_leaves_the_view_alone(session, look, monkeypatch):
@@ -138,7 +140,7 @@ def test_pictures_at_rest_are_those_of_the_scene(session, systems, lights, look)
     scene = systems["lobes"]
     reply = session.answer(look | {"kind": "still", "width": 48, "height": 32})
     camera = Camera(EYE, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 0.7, 48, 32)
-    expected = scene.direct.picture(lights["lamp"], camera)
+    expected = scene.without_bounces().picture(lights["lamp"], camera)
     near(halves(reply).reshape(32, 48, 3), expected)
 
 
