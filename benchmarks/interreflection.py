@@ -226,7 +226,7 @@ def errors(scene: Scene, pictures: pathlib.Path | None) -> dict:
                 (0.8 * triple.specular, triple.diffuse),
             )
         ]
-        rough = bounces.relight.coarse(triple.light.radiance, edge=8).reshape(6, 8, 1, 8, 1, 3)
+        rough = bounces.gather.coarse(triple.light.radiance, edge=8).reshape(6, 8, 1, 8, 1, 3)
         rough = Environment(jnp.broadcast_to(rough, (6, 8, 8, 8, 8, 3)).reshape(6, 64, 64, 3))
         exact, blurred = [], []
         for seed in (0, 1):

@@ -898,7 +898,7 @@ EXAMPLES = {
     ),
     "systems.lobe.narrow.share": example(lambda draw: call(10 + 10 * draw.uniform(5))),
     "systems.bounces.relight.area_mean": example(lambda draw: call(draw.normal(5, 2, 3), draw.uniform(5))),
-    "systems.bounces.relight.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
+    "systems.bounces.gather.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
     "systems.lamps.relight.beside": example(
         lambda draw: call(draw.uniform(5, low=2, high=90), draw.uniform(5, low=0.05, high=0.5))
     ),

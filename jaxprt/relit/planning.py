@@ -208,7 +208,7 @@ def plan(
         fast = [each for each in good if each.seconds <= count / total / rate]
         chosen = min(fast, key=lambda each: each.nbytes) if fast else min(good, key=lambda each: each.seconds)
         plans.append(GroupPlan(names, count, sample.mesh_error, chosen, considered))
-    reflected = reflection.fractions(shadings, environments, opacity=mesh.opacity)
+    reflected = reflection.fractions(shadings, environments, opacity=mesh.opacity, point_lights=scene.point_lights)
     bounces = reflection.needed(reflected, asked)
     names = tuple(part.name for part in scene.parts)
     return Plan(names, tuple(plans), reflected, bounces, float(asked), float(rate), size, key)

@@ -12,14 +12,13 @@ from jaxprt.relit import paths
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.groups import Place, joined_mesh
 from jaxprt.relit.recipes import Target, harmonic_table, lobe_table
-from jaxprt.scene import Environment
+from jaxprt.scene import Environment, Mesh, PointLight
 from jaxprt.scene.mesh import frames
 from jaxprt.scene.opacity import Opacity
-from jaxprt.systems import bounces, harmonic
+from jaxprt.systems import bounces, lamps
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart, traced
 from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.bright_texels import BrightTexels
-from jaxprt.systems.harmonic import TransferVector
 from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.lobe import LobeBrdf, LobeSystem
 from jaxprt.systems.protocol import System
@@ -27,7 +26,7 @@ from jaxprt.systems.protocol import System
 ALL = bounces.build.ALL
 _EACH = 3  # number of bounces that are estimated one by one; further ones are extrapolated as a geometric series
 _EDGE = 8  # largest edge of the faces of light that is reflected
-_DEGREE, _DIRECT, _REFLECTED = 4, 16, 8  # of the estimate: degree of harmonics, and edges of the faces of rays
+_PATCHES, _REFLECTED, _SAMPLES = 256, 8, 16  # of the estimate: patches, edge of the faces of rays, and points of lamps
 _SLOWEST = 0.95  # largest ratio of a bounce to the previous one
 _REGIONS = 16  # most regions of the transfer tensor, besides one for each group: its time and memory grow with them
 _LOBES = 8  # number of lobes for sharp parts whose system has no table of lobes
@@ -51,7 +50,7 @@ def check(count: int | str | None) -> None:
 
 
 def make(
-    shadings: Sequence[Shading], place: Place, count: int | str, target: Target, lamps: LampTransport | None = None
+    shadings: Sequence[Shading], place: Place, count: int | str, target: Target, lamp: LampTransport | None = None
 ) -> GroupBounces:
     """Precomputes the light of the environment and of lamps that all parts reflect onto each other and themselves.
 
@@ -63,7 +62,7 @@ def make(
         place: Where the vertices of the parts stand in their groups.
         count: Number of bounces, at least 1; or "all".
         target: Size of the light, and where and how to compute. All parts occlude each other, and all vertices are lit.
-        lamps: Transport of the lamps to the vertices of all parts; None without lamps.
+        lamp: Transport of the lamps to the vertices of all parts; None without lamps.
 
     Returns:
         The system of reflected light alone.
@@ -80,7 +79,7 @@ def make(
     options = {"edge": min(_EDGE, target.size), **target.options("bounces")}
     # Omit nothing: the number of bounces is decided, and later materials may reflect more.
     tensor = bounces.precompute(
-        mesh, [each.brdf for each in sent], weights=weights, lamps=lamps, bounces=count, **options
+        mesh, [each.brdf for each in sent], weights=weights, lamps=lamp, bounces=count, **options
     )
     groups = []
     for number, (shading, path) in enumerate(zip(first, of_group, strict=True)):
@@ -159,7 +158,11 @@ def is_sharp(shading: Shading, table: LobeBrdf | None) -> bool:
 
 
 def fractions(
-    shadings: Sequence[Shading], environments: Sequence[Environment], *, opacity: Opacity | None = None
+    shadings: Sequence[Shading],
+    environments: Sequence[Environment],
+    *,
+    opacity: Opacity | None = None,
+    point_lights: Sequence[PointLight] = (),
 ) -> Float[np.ndarray, "b p"]:
     """Estimates the fraction of each part's radiance that surfaces reflected at least once, twice and three times.
 
@@ -167,25 +170,22 @@ def fractions(
 
     Args:
         shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
-        environments: Environments. The result is the largest fraction under any of them.
+        environments: Environments. The result is the largest fraction under any of them, with the lamps of the scene,
+            and in the light of the lamps alone.
         opacity: Opacity of the vertices of all parts; None if all are opaque.
+        point_lights: Point lights, in the coordinates of the meshes.
 
     Returns:
         Relative L2 fraction for each number of bounces (rows) and part (columns).
     """
     mesh = dataclasses.replace(joined_mesh(shadings), opacity=opacity)
-    albedo = np.stack([paths.albedo(each) for each in shadings])
-    options = {"size": _REFLECTED, "progress": False}
-    direct = harmonic.precompute_diffuse(mesh, degree=_DEGREE, size=_DIRECT, progress=False)
-    each = [direct.vector]
-    for _ in range(_EACH):
-        last = TransferVector(each[-1], direct.position)
-        both = harmonic.interreflect_diffuse(mesh, last, albedo, bounces=1, **options)
-        each.append(both.vector - each[-1])
+    exchange = bounces.patches.exchange(mesh, patches=_PATCHES, size=_REFLECTED, edge=_REFLECTED)
     region, result = np.asarray(mesh.region), np.zeros((_EACH, len(shadings)))
-    for light in environments:
-        coefficient = harmonic.project(light, degree=_DEGREE)
-        lit = np.stack([np.asarray(harmonic.combine(coefficient, vector)) for vector in each])
+    albedo = np.stack([np.broadcast_to(paths.albedo(shading), 3) for shading in shadings])[exchange.region]
+    lamp = _irradiance(mesh, shadings, point_lights)
+    sources = [np.broadcast_to(exchange.lit(light), lamp.shape) + lamp for light in environments]
+    for source in [*sources, lamp] if lamp.any() else sources:
+        lit = np.stack(exchange.reflected(source, albedo, bounces=_EACH))
         for part in range(len(shadings)):
             own = lit[:, region == part]
             # The ratio is taken over two bounces, because odd and even bounces between two surfaces differ.
@@ -196,6 +196,20 @@ def fractions(
             left = [float(np.linalg.norm(own[number:].sum(0))) / whole for number in range(1, _EACH + 1)]
             result[:, part] = np.maximum(result[:, part], np.asarray(left))
     return result
+
+
+def _irradiance(
+    mesh: Mesh, shadings: Sequence[Shading], point_lights: Sequence[PointLight]
+) -> Float[np.ndarray, "v 3"]:
+    """Irradiance over pi of all vertices from lamps."""
+    glowing = [shading for shading in shadings if shading.emitted is not None]
+    radiance = [np.mean(np.asarray(shading.emitted), 0) for shading in glowing]
+    radiance += [np.asarray(light.intensity) for light in point_lights]
+    if not radiance:
+        return np.zeros((len(mesh.position), 3), np.float32)
+    sources = [*(shading.mesh for shading in glowing), *point_lights]
+    transport = lamps.precompute(mesh, sources, samples=_SAMPLES, pieces=1, apart=True, progress=False)
+    return np.asarray(transport.cosine).T @ np.stack(radiance).astype(np.float32) / np.float32(np.pi)
 
 
 def needed(reflected: Float[np.ndarray, "b p"], error: float) -> int | str:

@@ -10,7 +10,7 @@ import pytest
 import jaxprt as prt
 from jaxprt import lobe
 from jaxprt.brdf import Lambert
-from jaxprt.relit import Harmonics, RelitScene, exact_lamps, probes
+from jaxprt.relit import Harmonics, RelitScene, exact_lamps, probes, reflection
 from jaxprt.relit.channels import of_part
 from jaxprt.scene import Camera, Environment, Part, PointLight, Scene, TexturedMaterial, builtin
 from jaxprt.scene.environment import background
@@ -231,3 +231,8 @@ def test_reports_measure_lamps_too():
     report = relit().report([DARK])
     assert 0 < report.part[0].errors[0] < 0.2
     assert 0 < report.part[0].vertex_errors[0] < 0.2
+
+
+def test_plans_count_what_surfaces_reflect_of_lamps():
+    shading = of_part(hollow(2).scene.parts[0])
+    np.testing.assert_allclose(reflection.fractions([shading], [DARK])[:, 0], [0.5, 0.25, 0.125], rtol=0.03)

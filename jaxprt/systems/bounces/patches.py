@@ -13,6 +13,7 @@ A vertex receives light from the patches by its own form factors, distributed ov
 surfaces.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -26,6 +27,8 @@ from jaxtyping import Array, Float, Float16, Int
 from jaxprt import visibility
 from jaxprt.decompose import clustering
 from jaxprt.files.arrays import Layout
+from jaxprt.scene.environment import Environment
+from jaxprt.scene.mesh import Mesh, areas
 from jaxprt.sphere import cubemap
 from jaxprt.systems import separable
 from jaxprt.systems.bounces import gather
@@ -248,6 +251,61 @@ class Means(NamedTuple):
             whole = self.area[own].sum()
             result[number] = mean(own, self.area[own] / whole if whole > 0 else self.area[own])
         return result.astype(np.float32)
+
+
+class DiffuseExchange(NamedTuple):
+    """Diffuse light between patches, in NumPy: an estimate of what surfaces reflect onto each other.
+
+    Attributes:
+        factor: Form factors from patches to vertices.
+        light: Irradiance over pi of each vertex under unit radiance of each texel of the light.
+        mean: Means over the patches.
+        region: Region of each patch.
+    """
+
+    factor: Float[np.ndarray, "v j"]
+    light: Float[np.ndarray, "v l"]
+    mean: "Means"
+    region: Int[np.ndarray, " j"]
+
+    def lit(self, environment: Environment) -> Float[np.ndarray, "v c"]:
+        """Irradiance over pi of each vertex from an environment."""
+        return self.light @ np.asarray(gather.coarse(environment.radiance, edge=math.isqrt(self.light.shape[1] // 6)))
+
+    def reflected(
+        self, source: Float[np.ndarray, "v c"], albedo: Float[np.ndarray, "j c"], *, bounces: int
+    ) -> list[Float[np.ndarray, "v c"]]:
+        """Irradiance over pi of each vertex: the given one, and what arrives after each bounce.
+
+        Args:
+            source: Irradiance over pi from the light itself.
+            albedo: Albedo of each patch.
+            bounces: Number of bounces.
+        """
+        result = [source]
+        for _ in range(bounces):
+            result.append(self.factor @ (albedo * self.mean.of(result[-1])))
+        return result
+
+
+def exchange(mesh: Mesh, *, patches: int, size: int, edge: int) -> DiffuseExchange:
+    """Traces the light that patches of a mesh exchange.
+
+    Args:
+        mesh: The whole scene.
+        patches: Approximate number of patches.
+        size: Edge of the cubemap faces through whose texels rays are traced.
+        edge: Edge of the light's faces, a divisor of `size`.
+    """
+    position, normal = (np.asarray(column, np.float64) for column in (mesh.position, mesh.normal))
+    region = np.searchsorted(np.unique(mesh.region), mesh.region)
+    whole = np.arange(len(position))[None]
+    count = min(patches, max(1, len(position) // LEAST))
+    patch, of_region, _ = divide(position, normal, region, whole, patches=count)
+    job = PatchJob.make(mesh, None, None, size, patch=patch, edge=edge)
+    traced = visibility.blocks.compute(job, path=None, executor=None, progress=False, label="patches")
+    factor, light = (traced[name].astype(np.float32) for name in ("factor", "light"))
+    return DiffuseExchange(factor, light, Means(patch, areas(mesh), len(of_region)), of_region)
 
 
 def divide(

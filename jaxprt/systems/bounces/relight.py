@@ -22,9 +22,9 @@ from jaxprt.compile import isolated, jit, mapped
 from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
-from jaxprt.sphere import cubemap, directions, harmonics, rotation
+from jaxprt.sphere import directions, harmonics, rotation
 from jaxprt.systems import dynamic, protocol
-from jaxprt.systems.bounces import functions
+from jaxprt.systems.bounces import functions, gather
 from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.bounces.tensor import TransferTensor
 from jaxprt.systems.dynamic import DynamicBrdf, DynamicTransport, Material, RegionBrdf
@@ -325,40 +325,16 @@ def combine(
     return (whole if points is not None else whole[:, transport.place]).T
 
 
-@partial(jit, static_argnames=("edge",))
-def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c"]:
-    """Radiance of the texels of coarser faces. Each texel is distributed bilinearly to four coarse texels around it.
-
-    A small sun thus keeps its position to second order; nearest-texel averaging would move it to a texel's center.
-    Constant light is preserved exactly, and flux approximately.
-
-    Args:
-        radiance: Radiance of the fine texels.
-        edge: Edge of the coarse faces in texels.
-
-    Raises:
-        ValueError: The edge of the coarse faces does not divide that of the light's.
-    """
-    size = radiance.shape[1]
-    if edge < 1 or size % edge:
-        raise ValueError(f"the edge of coarse faces must divide the edge of the light's faces, {size}, got {edge}")
-    area, way = cubemap.solid_angle(size=size)[..., None], cubemap.direction(size=size)
-    each = jnp.concatenate([radiance * area, jnp.broadcast_to(area, radiance[..., :1].shape)], -1)
-    shape = jax.ShapeDtypeStruct((6, edge, edge, each.shape[-1]), each.dtype)
-    (total,) = jax.linear_transpose(lambda faces: cubemap.lookup(faces, way), shape)(each)
-    return (total[..., :-1] / total[..., -1:]).reshape(6 * edge * edge, -1)
-
-
 @isolated
 def _lit(tensor: TransferTensor, radiance: Array) -> LitTransfer:
-    light = coarse(radiance, edge=math.isqrt(tensor.mode.shape[1] // 6))
+    light = gather.coarse(radiance, edge=math.isqrt(tensor.mode.shape[1] // 6))
     first = _met(jnp.einsum("gle,lc->gce", tensor.mode, light), tensor.core)
     matte = None
     if tensor.patches is not None:
-        matte = tensor.patches.light @ coarse(radiance, edge=math.isqrt(tensor.patches.light.shape[1] // 6))
+        matte = tensor.patches.light @ gather.coarse(radiance, edge=math.isqrt(tensor.patches.light.shape[1] // 6))
     if tensor.second is None:
         return LitTransfer(first, None, matte)
-    again = coarse(radiance, edge=math.isqrt(tensor.second.core.shape[1] // 6)).T
+    again = gather.coarse(radiance, edge=math.isqrt(tensor.second.core.shape[1] // 6)).T
     return LitTransfer(first, _met(jnp.broadcast_to(again, (len(first), *again.shape)), tensor.second.core), matte)
 
 

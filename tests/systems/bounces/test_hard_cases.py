@@ -123,7 +123,7 @@ def test_a_sun_in_one_texel_reaches_no_vertex_twice_over(white):
     mesh = scene(ball(height=1.2), floor())
     sun = jnp.zeros((6, SIZE, SIZE, 1)).at[2, 3, 4].set(1e4)
     first, more, tensor = bounced(mesh, [white, white], Environment(sun))
-    soft = bounces.relight.coarse(sun, edge=2)
+    soft = bounces.gather.coarse(sun, edge=2)
     flux = (float(jnp.sum(each.ravel() * cubemap.solid_angle(size=n).ravel())) for each, n in ((soft, 2), (sun, SIZE)))
     assert next(flux) == pytest.approx(next(flux), rel=1e-5)
     lit, again = (bounces.light_side(tensor, Environment(x)) for x in (sun, soft.reshape(6, 2, 2, 1)))
