@@ -23,12 +23,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import harness, path_tracing
+from benchmarks.published.factorization import factor_symmetric
 from jaxprt import bright_texels, lobe, reference, separable, visibility
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.scene import Environment, builtin, load_environment, load_mesh
 from jaxprt.scene.mesh import Mesh, bounds, ground_plane, join
 from jaxprt.systems.lobe import LobeTransport
-from jaxprt.systems.separable import ClusteredTransport, combine, light_tuple, view_tuple
+from jaxprt.systems.separable import ClusteredTransport, SeparableSystem
 from jaxprt.visibility import StoredVisibility
 
 LIGHTS = {"Grace": "grace_cross.hdr", "Eucalyptus": "eucalyptus_rnl_cross.hdr", "sun": "polyhaven_sunrise_1k.exr"}
@@ -56,6 +57,7 @@ class Part:
 
     def __init__(self, visible: StoredVisibility | LobeTransport, brdf, factored, transport: ClusteredTransport):
         self.visible, self.brdf, self.factored, self.transport = visible, brdf, factored, transport
+        self.system = SeparableSystem(transport, factored)
 
 
 def main(options: Sequence[str] | None = None) -> None:
@@ -179,16 +181,16 @@ def compressed(visible, brdf, factored, clusters: int, limit: tuple[int, int, in
 
 
 @jax.jit
-def change_light(transport, visible, brdf, rest, texel, excess, view, eye):
+def change_light(system, visible, brdf, rest, texel, excess, view, eye):
     """Radiance of one object after a change of light: the view tuple is kept."""
-    smooth = combine(light_tuple(transport, rest), view)
+    smooth = system.combine(system.light(rest), view)
     return smooth + bright_texels.radiance(visible, brdf, texel, excess, eye=eye)
 
 
 @jax.jit
-def change_view(transport, visible, brdf, factored, lit, texel, excess, eye):
+def change_view(system, visible, brdf, lit, texel, excess, eye):
     """Radiance of one object after a change of view: the light tuple is kept."""
-    smooth = combine(lit, view_tuple(transport, factored, eye))
+    smooth = system.combine(lit, system.view(eye))
     return smooth + bright_texels.radiance(visible, brdf, texel, excess, eye=eye)
 
 
@@ -197,19 +199,19 @@ def report_case(name, parts: list[Part], sun, exact, lights, views, stored, prec
     vertices, named = sum(part.visible.position.shape[0] for part in parts), names(lights)
     for number, light in enumerate(lights):
         texel, excess, rest = bright_texels.split(light, count=sun)
-        lit = [light_tuple(part.transport, rest) for part in parts]
+        lit = [part.system.light(rest) for part in parts]
         square = np.zeros(2)
         for place, eye in enumerate(jnp.asarray(views)):
             for at, part in enumerate(parts):
-                now = change_view(part.transport, part.visible, part.brdf, part.factored, lit[at], texel, excess, eye)
+                now = change_view(part.system, part.visible, part.brdf, lit[at], texel, excess, eye)
                 square += exact[at].squares(number, place, now)
         eye = jnp.asarray(views[0])
-        view = [view_tuple(part.transport, part.factored, eye) for part in parts]
+        view = [part.system.view(eye) for part in parts]
 
         def lighten(light=light, view=view, eye=eye):
             texel, excess, rest = bright_texels.split(light, count=sun)
             return [
-                change_light(part.transport, part.visible, part.brdf, rest, texel, excess, each, eye)
+                change_light(part.system, part.visible, part.brdf, rest, texel, excess, each, eye)
                 for part, each in zip(parts, view, strict=True)
             ]
 
@@ -290,33 +292,32 @@ def measure_published(glossy, whole, exact, lights, views, quick: bool):
     count = len(glossy.position)
     size = lights[0].radiance.shape[-2]
     start = time.perf_counter()
-    factored = [separable.published.factor_symmetric(BRDF, terms=4, resolution=24 if quick else 48)]
+    factored = [factor_symmetric(BRDF, terms=4, resolution=24 if quick else 48)]
     factored.append(separable.factor(GROUND, terms=1, resolution=8))
     vertex = [np.arange(count), np.arange(count, len(whole.position))]
     parts = [
-        separable.precompute(whole, brdf, size=size, vertex=part, progress=False)
+        SeparableSystem(separable.precompute(whole, brdf, size=size, vertex=part, progress=False), brdf)
         for brdf, part in zip(factored, vertex, strict=True)
     ]
     seconds = time.perf_counter() - start
     eye = jnp.asarray(views[0])
-    view = [view_tuple(part, brdf, eye) for part, brdf in zip(parts, factored, strict=True)]
+    view = [part.view(eye) for part in parts]
     changes, lines, named = [], [], names(lights)
     for number, light in enumerate(lights):
 
         def lighten(light=light):
-            return [combine(light_tuple(part, light), each) for part, each in zip(parts, view, strict=True)]
+            return [part.combine(part.light(light), each) for part, each in zip(parts, view, strict=True)]
 
-        lit = [light_tuple(part, light) for part in parts]
+        lit = [part.light(light) for part in parts]
 
         def turn(eye=eye, lit=lit):
-            pairs = zip(parts, factored, lit, strict=True)
-            return [combine(each, view_tuple(part, brdf, eye)) for part, brdf, each in pairs]
+            return [part.combine(each, part.view(eye)) for part, each in zip(parts, lit, strict=True)]
 
         square = np.zeros(2)
         for place, each in enumerate(jnp.asarray(views)):
             for at, now in enumerate(turn(eye=each)):
                 square += exact[at].squares(number, place, now)
-        stored = sum(part.nbytes for part in parts)
+        stored = sum(part.transport.nbytes for part in parts)
         error = float(np.sqrt(square[0] / square[1]))
         changes.append((lighten, error))
         lines.append(

@@ -21,6 +21,7 @@ import numpy as np
 from jax.interpreters import partial_eval
 
 from benchmarks import harness
+from benchmarks.published.quantized import quantize
 from benchmarks.rasterize import facing, torus
 from benchmarks.relight_separable import synthetic
 from jaxprt import System, bounces, bright_texels, dynamic, harmonic, lobe, memory, separable
@@ -28,7 +29,6 @@ from jaxprt.brdf import CookTorrance
 from jaxprt.image import rasterize, resolve, shading_points
 from jaxprt.scene import Environment, Mesh
 from jaxprt.sphere import directions
-from jaxprt.systems.separable.quantized import quantize
 
 VERTICES = 36_000, 300_000, 1_000_000
 MEMBERS = 225  # vertices of a cluster

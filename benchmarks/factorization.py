@@ -6,7 +6,7 @@ The matrix is that of Ashikhmin-Shirley's BRDF (0.5, 0.75, 10, 100) at the texel
 Errors are by how much the Frobenius error of the approximation of that rank exceeds the optimum's, relative to it.
 NumPy is given the matrix in float64, in which the optimum is computed; in float32 its `eigh` takes as long.
 
-`--figure` prints instead the errors that figure 4 of Wang et al. plots, for five BRDFs: `errors.sample_error`,
+`--figure` prints instead the errors that figure 4 of Wang et al. plots, for five BRDFs: `sample_error`,
 relative, of 1 to 16 terms on maps of 16 to 64 texels along an edge. It needs JAXPRT_DATA for clay and skin.
 """
 
@@ -18,11 +18,11 @@ import numpy as np
 import scipy.sparse.linalg
 
 from benchmarks import harness
+from benchmarks.published.factorization import brown_plastic, factor_symmetric, red_plastic, sample_error
 from jaxprt import separable
 from jaxprt.brdf import AshikhminShirley, load_lafortune
 from jaxprt.decompose import eigen
 from jaxprt.sphere import hemisphere
-from jaxprt.systems.separable import sample_error
 
 TERMS = (4, 8, 16, 32, 64)
 QUICK = (8,)
@@ -100,8 +100,8 @@ def figure() -> None:
     path = harness.data() / "brdf/lafortune_measured.json"
     brdfs = {
         "Ashikhmin-Shirley (10, 100)": AshikhminShirley(),
-        "red plastic": separable.published.red_plastic(),
-        "light brown plastic": separable.published.brown_plastic(),
+        "red plastic": red_plastic(),
+        "light brown plastic": brown_plastic(),
         "Lafortune, clay": load_lafortune(path, "clay"),
         "Lafortune, skin": load_lafortune(path, "skin"),
     }
@@ -109,8 +109,7 @@ def figure() -> None:
         print(f"{name}: terms down, texels along an edge across")
         print("     " + "".join(f"{resolution:>8}" for resolution in RESOLUTIONS))
         factored = [
-            separable.published.factor_symmetric(brdf, terms=max(FIGURE_TERMS), resolution=resolution)
-            for resolution in RESOLUTIONS
+            factor_symmetric(brdf, terms=max(FIGURE_TERMS), resolution=resolution) for resolution in RESOLUTIONS
         ]
         for terms in FIGURE_TERMS:
             errors = [float(sample_error(brdf, each.truncate(terms))[1]) for each in factored]

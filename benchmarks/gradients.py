@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+import jaxprt as prt
 from benchmarks import harness, relight_separable
 from jaxprt import bounces, brdf, bright_texels
 from jaxprt import dynamic as dynamic_system
@@ -230,7 +231,7 @@ def _terms(transport, terms: int) -> Case:
 
     def radiance(light, material, eye):
         own = SeparableBrdf(factored.light_map, material, factored.error, factored.coordinates)
-        return separable_system.radiance(transport, own, Environment(light), eye=eye)
+        return prt.radiance(separable_system.SeparableSystem(transport, own), Environment(light), eye=eye)
 
     return Case(radiance, {"light": sky(), "material": factored.view_map, "eye": EYE}, transport.nbytes)
 

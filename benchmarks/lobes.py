@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import compression, harness
+from benchmarks.published.lobes import Remainder
 from jaxprt import bright_texels, lobe, reference, separable, visibility
 from jaxprt.brdf import AshikhminShirley, CookTorrance
 from jaxprt.scene import Environment
@@ -67,7 +68,7 @@ def measure(quick: bool):
             if quick or count == 8:
                 terms = (2,) if quick else REMAINDER
                 rest = Environment(jnp.stack([bright_texels.split(light, count=SUN)[2].radiance for light in lights]))
-                left = lobe.Remainder(brdf, table)
+                left = Remainder(brdf, table)
                 most = separable.factor(left, terms=max(terms), resolution=12 if quick else 64)
                 more = [
                     radiance(most.truncate(number), seen, visible, rest, views, error=TERMS_ERROR) for number in terms

@@ -30,7 +30,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import compression, harness
-from jaxprt import bright_texels, dynamic, lobe, reference, separable, visibility
+from benchmarks.published.lobes import mirror_lobes
+from jaxprt import bright_texels, dynamic, reference, separable, visibility
 from jaxprt.brdf import CookTorrance, Lambert, navigation
 from jaxprt.image import interpolate, raster
 from jaxprt.scene import Environment, Mesh, builtin, camera, environment, load_mesh
@@ -260,7 +261,7 @@ def figure_5(quick: bool):
     brdfs = family.brdf[:: 20 if quick else 1]
     tables: dict[str, tuple] = {"free lobes": (dynamic.separate(brdfs, lobes=2 if quick else 8), [(2, 4), (4, 8)])}
     if not quick:
-        mirror = dynamic.separate(brdfs, separator=lobe.published.mirror_lobes)
+        mirror = dynamic.separate(brdfs, separator=mirror_lobes)
         more = [(1, 4), (2, 4), (4, 8), (6, 32)]
         tables |= {"no lobes": (None, more), "published lobes": (mirror, more)}
     for name, (lobes, ranks) in tables.items():

@@ -16,11 +16,11 @@ import numpy as np
 import scipy.sparse
 
 from benchmarks import harness
+from benchmarks.published.quantized import quantize
 from jaxprt import separable
 from jaxprt.brdf import AshikhminShirley
 from jaxprt.sphere import directions
-from jaxprt.systems.separable import SparseTransport, combine, view_tuple
-from jaxprt.systems.separable.quantized import quantize
+from jaxprt.systems.separable import SeparableSystem, SparseTransport
 
 SIZE = 64
 TERMS = 4
@@ -84,8 +84,9 @@ def measure(transport: SparseTransport, brdf, light: jax.Array, repeats: int) ->
         peer_line = {"peer": name, **second.peer(), "peer_error": wrong / float(np.linalg.norm(exact))}
         lines.append({**common, **case, **first.line(), **peer_line})
     eye = jnp.array([3.0, 1.0, 2.0])
+    system = SeparableSystem(transport, brdf)
     view, change = harness.compare(
-        lambda: combine(mine, view_tuple(transport, brdf, eye)), lambda: transport.apply(light), repeats=repeats
+        lambda: system.combine(mine, system.view(eye)), lambda: transport.apply(light), repeats=repeats
     )
     case = {"case": f"view change, {vertices} vertices", "nanoseconds_per_vertex": view.seconds / vertices * 1e9}
     lines.append({**common, **case, **view.line(), "peer": "light change", **change.peer(), "peer_error": 0.0})

@@ -22,13 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import harness
+from benchmarks.published.quantized import quantize
 from jaxprt import separable
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.image import interpolate, rasterize
 from jaxprt.scene import Camera, Mesh, builtin, camera, load_mesh, occluder
 from jaxprt.scene.mesh import ground_plane, join
-from jaxprt.systems.separable import QuantizedTransport, SeparableBrdf, combine, light_tuple, view_tuple
-from jaxprt.systems.separable.quantized import quantize
+from jaxprt.systems.separable import SeparableBrdf, SeparableSystem
 
 KEEP = 96
 SIZE = 64
@@ -114,7 +114,7 @@ def measure(
         }
         edge = PICTURE if paper else 64
         shot = camera.orbit(mesh, elevation=0.3, width=edge, height=edge)
-        view, light = frames([(q, brdf) for (_, q), brdf in parts], whole, shot, size, repeats)
+        view, light = frames([SeparableSystem(q, brdf) for (_, q), brdf in parts], whole, shot, size, repeats)
         timings = {"precompute": harness.Timing(seconds, compiled, 1), "view": view, "light": light}
         for what, timing in timings.items():
             line = {**common, "case": f"{what}, {name}, {terms} terms", "what": what, **timing.line()}
@@ -129,23 +129,20 @@ def precompute(mesh: Mesh, brdf: SeparableBrdf, shadows: Mesh, size: int):
 
 
 def frames(
-    parts: list[tuple[QuantizedTransport, SeparableBrdf]], mesh: Mesh, shot: Camera, size: int, repeats: int
+    parts: list[SeparableSystem], mesh: Mesh, shot: Camera, size: int, repeats: int
 ) -> tuple[harness.Timing, harness.Timing]:
     """A change of view, which keeps the light's tuples, and one of light, which keeps the view's; both drawn."""
     environment = builtin.daylight(size=size)
-    lights = [light_tuple(each, environment) for each, _ in parts]
-    views = [view_tuple(each, brdf, jnp.asarray(shot.eye)) for each, brdf in parts]
+    lights = [part.light(environment) for part in parts]
+    views = [part.view(jnp.asarray(shot.eye)) for part in parts]
     drawn = rasterize(mesh, shot)
 
     def view():
-        colors = [
-            combine(g, view_tuple(each, brdf, jnp.asarray(shot.eye)))
-            for g, (each, brdf) in zip(lights, parts, strict=True)
-        ]
+        colors = [part.combine(g, part.view(jnp.asarray(shot.eye))) for g, part in zip(lights, parts, strict=True)]
         return interpolate(rasterize(mesh, shot), mesh.face, jnp.concatenate(colors))
 
     def light():
-        colors = [combine(light_tuple(each, environment), h) for h, (each, _) in zip(views, parts, strict=True)]
+        colors = [part.combine(part.light(environment), h) for h, part in zip(views, parts, strict=True)]
         return interpolate(drawn, mesh.face, jnp.concatenate(colors))
 
     return harness.measure(view, repeats=repeats), harness.measure(light, repeats=repeats)
@@ -154,7 +151,7 @@ def frames(
 def change(parts: list, size: int) -> float:
     """Relative L2 difference of the light tuples that whole numbers make."""
     environment = builtin.daylight(size=size)
-    pairs = [[light_tuple(each, environment) for each in both] for both, _ in parts]
+    pairs = [[SeparableSystem(each, brdf).light(environment) for each in both] for both, brdf in parts]
     return float(
         jnp.sqrt(sum(jnp.sum((q - plain) ** 2) for plain, q in pairs) / sum(jnp.sum(plain**2) for plain, _ in pairs))
     )

@@ -274,7 +274,7 @@ def test_no_imports_form_a_circle():
     [
         ("jaxprt.sphere.haar", "jaxprt.scene.mesh"),
         ("jaxprt.visibility.stored", "jaxprt.systems.lobe"),
-        ("jaxprt.systems.separable.wavelets", "jaxprt.systems.lobe"),
+        ("jaxprt.systems.separable.sparse", "jaxprt.systems.lobe"),
         ("jaxprt.systems.lobe.table", "jaxprt.systems.dynamic.brdf_set"),
         ("jaxprt.brdf.models", "jaxprt.systems.separable"),
         ("jaxprt.systems.lobe.table", "jaxprt.systems.lobe"),
@@ -299,7 +299,7 @@ def test_the_table_forbids(importer, imported):
         ("jaxprt.systems.lobe.relight", "jaxprt.systems.lobe.table"),
         ("jaxprt.systems.dynamic.relight", "jaxprt.systems.lobe"),
         ("jaxprt.systems.bounces.relight", "jaxprt.systems.dynamic.relight"),
-        ("jaxprt.systems.separable.wavelets", "jaxprt.visibility.blocks"),
+        ("jaxprt.systems.separable.sparse", "jaxprt.visibility.blocks"),
         ("jaxprt.cli.main", "jaxprt"),
         ("jaxprt.__main__", "jaxprt.cli.main"),
     ],

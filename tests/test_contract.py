@@ -29,6 +29,9 @@ import numpy as np
 import pytest
 
 import jaxprt
+from benchmarks import published
+from benchmarks.published.lobes import Remainder
+from benchmarks.published.quantized import quantize
 from jaxprt import bounces, brdf, dynamic, scene, visibility
 from jaxprt import harmonic as harmonic_system
 from jaxprt import lobe as lobe_system
@@ -78,7 +81,11 @@ HOST = {
     "visibility.packets": "traces rays",
     "visibility.blocks": "runs workers and writes files",
     "visibility.refinement": "traces rays, and chooses by values",
-    "systems.separable.wavelets.precompute": "traces rays",
+    "systems.separable.sparse.precompute": "traces rays",
+    "benchmarks.published.factorization": "checks values",
+    "benchmarks.published.lobes.mirror_lobes": "checks values",
+    "benchmarks.published.tensors.factor_tensor": "checks values",
+    "benchmarks.published.tensors.hooi": "gives vectors of either sign",
     "systems.axes": "reads annotations",
     "systems.ranges": "cuts objects",
     "visibility.stored.precompute": "traces rays",
@@ -138,8 +145,7 @@ HOST = {
     "decompose.tucker.oriented": "the same",
     "decompose.tucker.hosvd": "gives vectors of either sign, whose reconstruction alone has derivatives",
     "decompose.tucker.truncated": "the same",
-    "decompose.tucker.hooi": "the same",
-    "decompose.tucker.ranks_for": "chooses by values, on the host",
+    "decompose.tucker.dominant": "the same",
     "brdf.scattered": "reads files, checks values, and interpolates by SciPy",
     "brdf.coat.coat_reflectance": "one formula for NumPy and JAX arrays",
     "brdf.measured.cell_angles": "a NumPy table of angles",
@@ -194,7 +200,6 @@ HOST = {
     "systems.bounces.between.quadratic": "takes indices; tested through bounces.factor",
     "brdf.navigation.blinn_phong": "checks values",
     "brdf.navigation.cook_torrance": "reads a file",
-    "systems.dynamic.published.factor_tensor": "checks values",
     "systems.dynamic.transport.precompute": "traces rays",
     "systems.dynamic.transport.compress": "runs workers and writes files",
     "systems.dynamic.relight.check_material": "checks values",
@@ -213,11 +218,8 @@ HOST = {
     "systems.bounces.relight.gathered": "takes half precision; the same",
     "systems.bounces.relight.changes": "takes half precision; the same",
     "systems.lobe.em": "the steps of lobe.tabulate, and tested through it",
-    "systems.separable.published": "checks values",
-    "systems.lobe.published": "checks values",
-    "systems.separable.errors": "draws its own directions",
+    "systems.separable.factorization.light_errors": "draws its own directions",
     "systems.separable.factorization.tabulate": "checks values",
-    "systems.separable.factorization.join": "puts arrays side by side, and makes an error that is NaN",
     "image.arguments": "checks values",
     "scene.mesh_arrays": "checks values",
     "scene.normals": "NumPy, where data enters",
@@ -493,11 +495,6 @@ def nothing(draw):
     return call()
 
 
-def lit(draw):
-    """Transport, BRDF and light that fit together."""
-    return draw.sparse(), draw.separable(), draw.light()
-
-
 EXAMPLES = {
     "sphere.directions.normalize": example(lambda draw: call(draw.normal(5, 3))),
     "sphere.directions.tangent": example(lambda draw: call(draw.unit(5))),
@@ -743,10 +740,8 @@ EXAMPLES = {
     "systems.dynamic.brdf_set.between": example(lambda draw: call(draw.uniform(3), draw.uniform(3))),
     "systems.bounces.functions.albedo": example(lambda draw: call(draw.separable())),
     "systems.bounces.functions.project": example(lambda draw: call(draw.separable()), degree=2),
-    "systems.lobe.remainder.Remainder": example(
-        lambda draw: call(
-            lobe_system.Remainder(brdf.Lambert(draw.uniform(3)), draw.lobes()), draw.upper(5), draw.upper(5)
-        ),
+    "benchmarks.published.lobes.Remainder": example(
+        lambda draw: call(Remainder(brdf.Lambert(draw.uniform(3)), draw.lobes()), draw.upper(5), draw.upper(5)),
     ),
     "systems.harmonic.table.project": example(
         lambda draw: call(brdf.AshikhminShirley(draw.uniform(3), draw.uniform(3), 10.0, 60.0), draw.upper(5)),
@@ -779,10 +774,10 @@ EXAMPLES = {
     "image.tonemap.encode_srgb": example(lambda draw: call(draw.uniform(20, low=-0.01, high=1))),
     "image.tonemap.decode_srgb": example(lambda draw: call(draw.uniform(20, low=-0.01, high=1))),
     "image.tonemap.display": example(lambda draw: call(draw.uniform(20, low=-0.01, high=2)), tone="filmic"),
-    "systems.separable.wavelets.project": example(
+    "systems.separable.sparse.project": example(
         lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable()),
     ),
-    "systems.separable.wavelets.compress": example(
+    "systems.separable.sparse.compress": example(
         lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable()), keep=5
     ),
     # Frames have derivatives along rotations only; see sphere.rotation.
@@ -823,10 +818,8 @@ EXAMPLES = {
     ),
     "systems.harmonic.transfer.right_handed": example(lambda draw: call(draw.rotation(4))),
     # Rounding is constant; what it is relative to is differentiable in dequantize.
-    "systems.separable.quantized.quantize": example(lambda draw: call(draw.sparse()), gradient=()),
-    "systems.separable.quantized.dequantize": example(
-        lambda draw: call(separable_system.quantized.quantize(draw.sparse()))
-    ),
+    "benchmarks.published.quantized.quantize": example(lambda draw: call(draw.sparse()), gradient=()),
+    "benchmarks.published.quantized.dequantize": example(lambda draw: call(quantize(draw.sparse()))),
     "systems.separable.sparse.largest": example(lambda draw: call(draw.normal(2, 9, 2, 3)), keep=4),
     "scene.texture.lookup": example(lambda draw: call(draw.normal(3, 4, 2), draw.normal(5, 2))),
     "scene.points.placed": example(
@@ -835,10 +828,7 @@ EXAMPLES = {
         )
     ),
     # Rounding is constant but for the largest coefficient, which makes steps of all others.
-    "systems.separable.relight.quantize": example(lambda draw: call(draw.normal(24, 3)), gradient=()),
-    "systems.separable.relight.modulate": example(
-        lambda draw: call(draw.normal(4, 3, 1), draw.normal(4, 2, 3)), terms=(1, 2)
-    ),
+    "benchmarks.published.coefficients.quantize": example(lambda draw: call(draw.normal(24, 3)), gradient=()),
     "systems.reference.integrate": example(
         lambda draw: call(
             draw.seen(2),
@@ -970,32 +960,29 @@ EXAMPLES = {
         gradient=("brdf", "position", "materials", "eye"),
     ),
     "systems.harmonic.relight.combine": example(lambda draw: call(draw.normal(4, 3), draw.normal(4, 1, 5))),
-    "systems.separable.relight.project": example(lambda draw: call(draw.light())),
-    "systems.separable.relight.choose_by_magnitude": example(lambda draw: call(draw.normal(24, 3)), threshold=9000),
-    "systems.separable.relight.choose_by_area": example(lambda draw: call(draw.normal(24, 3)), count=7),
-    "systems.separable.relight.choose_by_transport": example(
+    "systems.separable.system.project": example(lambda draw: call(draw.light())),
+    "benchmarks.published.coefficients.choose_by_magnitude": example(
+        lambda draw: call(draw.normal(24, 3)), threshold=9000
+    ),
+    "benchmarks.published.coefficients.choose_by_area": example(lambda draw: call(draw.normal(24, 3)), count=7),
+    "benchmarks.published.coefficients.choose_by_transport": example(
         lambda draw: call(draw.normal(24, 3), draw.uniform(24)),
         gradient=("coefficient",),  # The weights only choose.
         count=7,
     ),
-    "systems.separable.relight.light_tuple": example(lambda draw: call(draw.sparse(), draw.light()), light_keep=40),
-    "systems.separable.relight.view_tuple": example(
-        lambda draw: call(mesh := draw.sparse(), draw.separable(), draw.above(mesh)),
-    ),
-    "systems.separable.relight.view_factors": example(
+    "systems.separable.system.light_tuple": example(lambda draw: call(draw.sparse(), draw.light())),
+    "systems.separable.system.view_tuple": example(
         lambda draw: call(draw.separable(), (mesh := draw.sparse()).position, mesh.frame, draw.above(mesh)),
     ),
-    "systems.separable.relight.combine": example(lambda draw: call(draw.normal(4, 2, 1), draw.normal(4, 2, 3))),
-    "systems.separable.relight.radiance": example(
-        lambda draw: call(*(all := lit(draw)), eye=draw.above(all[0])),
-    ),
+    "systems.separable.system.combine": example(lambda draw: call(draw.normal(4, 2, 1), draw.normal(4, 2, 3))),
 }
 
 
 def _public() -> dict[str, Callable]:
     """Public functions, and public classes that can be called, by their name without the package's."""
     result = {}
-    for module in pkgutil.walk_packages(jaxprt.__path__, "jaxprt."):
+    packages = ((jaxprt, "jaxprt."), (published, "benchmarks.published."))
+    for module in (module for package, name in packages for module in pkgutil.walk_packages(package.__path__, name)):
         if module.name.endswith("__main__"):
             continue
         for name, value in vars(importlib.import_module(module.name)).items():
@@ -1022,7 +1009,12 @@ TAKING_ARRAYS = [name for name in PURE if name in EXAMPLES and EXAMPLES[name].bu
 # Their residuals are rounding, and their vectors have either sign: they are held to what they give without jit.
 OF_ROUNDING = ["decompose.eigen.symmetric", "decompose.eigen.power", "decompose.eigen.left_singular"]
 # The harmonic system has lights of another kind. Jitted functions know no values; their lights were checked before.
-LIT = [name for name in PURE if ".relight." in name and "harmonic" not in name and not isinstance(PUBLIC[name], JITTED)]
+RELIGHTING = re.compile(r"systems\..*\.(relight|system|blurred_light)\.")
+LIT = [
+    name
+    for name in PURE
+    if RELIGHTING.match(name) and "harmonic" not in name and not isinstance(PUBLIC[name], JITTED)
+]
 
 
 @pytest.fixture(scope="module")

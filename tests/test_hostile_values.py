@@ -419,7 +419,7 @@ def system_verbs() -> dict[str, Verb]:
         "lobe.prefilter": Verb(prt.lobe.prefilter, light=environment()),
         "lobe.tabulate": Verb(prt.lobe.tabulate, brdf=model, lobes=1, error=None, resolution=8, knot=()),
         "separable.factor": Verb(prt.separable.factor, brdf=model, terms=1, error=None, light=None, resolution=8),
-        "separable.project": Verb(prt.separable.project, light=environment()),
+        "separable.system.project": Verb(prt.separable.system.project, light=environment()),
         "lamps.precompute": Verb(
             prt.lamps.precompute,
             lamps=[prt.scene.PointLight("lamp", [0, 3, 0])],

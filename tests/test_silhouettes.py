@@ -24,7 +24,7 @@ def scene():
 def separable(mesh, visible, eye):
     brdf = prt.separable.factor(prt.brdf.Lambert(ALBEDO), terms=1, resolution=8)
     transport = prt.separable.precompute(mesh, brdf, keep=384, size=8, progress=False)
-    return prt.separable.radiance(transport, brdf, WHITE, eye=eye)
+    return prt.radiance(prt.separable.SeparableSystem(transport, brdf), WHITE, eye=eye)
 
 
 def harmonic(mesh, visible, eye):

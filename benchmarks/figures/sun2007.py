@@ -15,7 +15,9 @@ import numpy as np
 from benchmarks import harness
 from benchmarks.figures import drawing
 from benchmarks.figures.run import Clock, Run
-from jaxprt import dynamic, image, lobe
+from benchmarks.published.lobes import mirror_lobes
+from benchmarks.published.tensors import hooi
+from jaxprt import dynamic, image
 from jaxprt.brdf import navigation
 from jaxprt.decompose import tucker
 from jaxprt.scene import builtin, camera
@@ -93,7 +95,7 @@ def separated(run: Run, brdfs: Sequence, angles: tuple[int, ...]) -> LobeBrdf:
     def one(brdf):
         f0, roughness = place_of(brdf)
         name = f"mirror_{len(angles)}_{nodes}_{f0:.4g}_{roughness:.4g}"
-        return run.kept(name, lambda: lobe.published.mirror_lobes(brdf, angles=angles, resolution=nodes))
+        return run.kept(name, lambda: mirror_lobes(brdf, angles=angles, resolution=nodes))
 
     return dynamic.separate(brdfs, separator=one)
 
@@ -158,7 +160,7 @@ def settings(tensor: jax.Array, whole: float, sets: Sequence[int], terms: Sequen
 
 def best(tensor: jax.Array, whole: float, ranks: tuple[int, int, int]) -> float:
     """Squared relative error of the finest setting after two sweeps of the iteration that the paper cites."""
-    core = np.asarray(tucker.hooi(tensor, ranks=ranks, sweeps=2)[0].core, np.float64)
+    core = np.asarray(hooi(tensor, ranks=ranks, sweeps=2)[0].core, np.float64)
     return float((squared_norm(tensor) - np.sum(core**2)) / whole)
 
 

@@ -12,17 +12,23 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+import jaxprt as prt
 from benchmarks import harness, tables
 from benchmarks.figures import drawing
 from benchmarks.figures.run import Run
+from benchmarks.published.factorization import (
+    brown_plastic,
+    factor_normalized,
+    factor_symmetric,
+    red_plastic,
+    sample_error,
+)
 from jaxprt import image, reference, separable, visibility
 from jaxprt.brdf import AshikhminShirley, Lambert, load_lafortune
 from jaxprt.scene import Environment, Mesh, builtin, camera
 from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.sphere import cubemap, directions
 from jaxprt.systems.separable import SeparableBrdf, SparseTransport
-from jaxprt.systems.separable.errors import sample_error
-from jaxprt.systems.separable.published import brown_plastic, factor_symmetric, red_plastic
 
 EDGE, TERMS, KEEP = 512, 4, 96
 GLOSSY = AshikhminShirley(diffuse=0.5, specular=0.75, nu=10, nv=100)
@@ -75,14 +81,14 @@ class Stage:
             part = np.resize(number[first : first + _BLOCK], _BLOCK)
             transport = self.transport(factored, part, keep)
             size += transport.nbytes
-            color = separable.radiance(transport, factored, light, eye=jnp.asarray(self.view.eye))
+            color = prt.radiance(separable.SeparableSystem(transport, factored), light, eye=jnp.asarray(self.view.eye))
             result.append(np.asarray(color)[: len(number) - first])
         return np.concatenate(result), size
 
     def transport(self, factored: SeparableBrdf, part: np.ndarray, keep: int) -> SparseTransport:
         """Transport of a block of vertices, as published, from stored visibility."""
         level, frame = self.seen.seen(part), self.seen.frame[part]
-        index, value = separable.wavelets.compress(level, frame, factored, keep=min(keep, level.shape[1]))
+        index, value = separable.sparse.compress(level, frame, factored, keep=min(keep, level.shape[1]))
         rms = separable.sparse.rms(index, value, level.shape[1])
         return SparseTransport(index, value, self.seen.position[part], frame, rms)
 
@@ -126,7 +132,7 @@ def figure_1(run: Run) -> Iterator[dict[str, Any]]:
     """The dragon in Uffizi and the bunny in Grace, on diffuse grounds, with 4 terms of 96 coefficients."""
     pictures, captions = [], []
     maps = 12 if run.quick else 48
-    ground = separable.published.factor_normalized(Lambert(0.5), resolution=16)
+    ground = factor_normalized(Lambert(0.5), resolution=16)
     for name, file, brdf, light, azimuth in (
         ("dragon", "dragon_100k.ply", GLOSSY, "uffizi", 0.3),
         ("bunny", "stanford_bunny.ply", red_plastic(), "grace", 0.2),
@@ -173,7 +179,7 @@ def figure_3(run: Run) -> Iterator[dict[str, Any]]:
     stage = Stage(run, "bunny", run.mesh("stanford_bunny.ply"), ground=22_000, azimuth=0.2, part="ground", wide=1.5)
     size = stage.seen.size
     light, number = sun(size), np.arange(len(stage.shown))
-    ground = separable.published.factor_normalized(Lambert(0.5), resolution=16)
+    ground = factor_normalized(Lambert(0.5), resolution=16)
     keeps = (8, 32) if run.quick else KEEPS
     blocks: dict[int, list] = {keep: [] for keep in keeps}
     for first in range(0, len(number), _BLOCK):
@@ -181,7 +187,7 @@ def figure_3(run: Run) -> Iterator[dict[str, Any]]:
         most = stage.transport(ground, part, max(keeps))
         for keep in keeps:
             cut = dataclasses.replace(most, value=most.value * (np.arange(max(keeps)) < keep)[:, None, None, None])
-            color = separable.radiance(cut, ground, light, eye=jnp.asarray(stage.view.eye))
+            color = prt.radiance(separable.SeparableSystem(cut, ground), light, eye=jnp.asarray(stage.view.eye))
             blocks[keep].append(np.asarray(color)[: len(number) - first])
     exact = stage.exact(Lambert(0.5), light, number)
     radiance = {keep: np.concatenate(each) for keep, each in blocks.items()}

@@ -102,7 +102,7 @@ def hosvd(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...]) -> Tucker:
     Reference: De Lathauwer, De Moor, Vandewalle 2000.
     """
     _check(tensor, ranks)
-    factor = tuple(_dominant(gram(tensor, mode=mode), rank) for mode, rank in enumerate(ranks))
+    factor = tuple(dominant(gram(tensor, mode=mode), rank) for mode, rank in enumerate(ranks))
     return Tucker(_core(tensor, factor), factor)
 
 
@@ -127,73 +127,9 @@ def truncated(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...]) -> Tucker:
     _check(tensor, ranks)
     factor, core = [jnp.zeros(0)] * tensor.ndim, tensor
     for mode in sorted(range(tensor.ndim), key=lambda mode: tensor.shape[mode]):
-        factor[mode] = _dominant(gram(core, mode=mode), ranks[mode])
+        factor[mode] = dominant(gram(core, mode=mode), ranks[mode])
         core = multiply(core, factor[mode], mode=mode)
     return Tucker(core, tuple(factor))
-
-
-@partial(jit, static_argnames=("ranks", "sweeps"))
-def hooi(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...], sweeps: int = 2) -> tuple[Tucker, Float[Array, " s"]]:
-    """Higher-order orthogonal iteration: finds the best factor of each mode in turn, given the other factors.
-
-    Args:
-        tensor: A tensor with at least two modes.
-        ranks: Rank of each mode.
-        sweeps: Number of sweeps over all modes. The iteration starts from the result of `truncated`.
-
-    Returns:
-        The decomposition, differentiable in the same sense as that of `hosvd`; and the relative L2 error at the start
-        and after each sweep. The error never grows, apart from rounding. It is computed from a difference of squares,
-        so in float32 it is inaccurate below about 3e-4.
-
-    Raises:
-        ValueError: `sweeps` is negative, the number of ranks is not the number of modes, or a rank is not between 1 and
-            its mode's size.
-
-    Reference: De Lathauwer, De Moor, Vandewalle 2000, "On the best rank-1 and rank-(R1, ..., RN) approximation".
-    """
-    if sweeps < 0:
-        raise ValueError(f"sweeps must not be negative, got {sweeps}")
-    now = truncated(tensor, ranks=ranks)
-    whole = jnp.vdot(tensor, tensor)
-
-    def error(core):
-        left = jnp.maximum(whole - jnp.vdot(core, core), 0)
-        left = jnp.where(whole > 0, left / jnp.where(whole > 0, whole, 1), 0)
-        return jnp.where(left > 0, jnp.sqrt(jnp.where(left > 0, left, 1)), 0)
-
-    errors, factor, core = [error(now.core)], list(now.factor), now.core
-    for _ in range(sweeps):
-        for mode in range(tensor.ndim):
-            others = _core(tensor, tuple(factor), but=mode)
-            factor[mode] = _dominant(gram(others, mode=mode), ranks[mode])
-            core = multiply(others, factor[mode], mode=mode)
-        errors.append(error(core))
-    return Tucker(core, tuple(factor)), jnp.stack(errors)
-
-
-def ranks_for(tensor: Float[Array, "*n"], *, error: float) -> tuple[int, ...]:
-    """Ranks for which `hosvd` and `truncated` are certain to stay within a relative L2 error. Runs on the host.
-
-    Each mode may contribute an equal share of the squared error, and gets the smallest rank for that share.
-
-    Args:
-        tensor: A tensor with at least two modes.
-        error: Largest relative L2 error, between 0 and 1. In float32, errors below about 3e-4 cannot be resolved.
-
-    Raises:
-        ValueError: `error` is out of range, or the tensor is not finite.
-    """
-    if not 0 < error < 1:
-        raise ValueError(f"error must be between 0 and 1, got {error}")
-    result = []
-    for mode in range(tensor.ndim):
-        square = np.asarray(jnp.linalg.eigvalsh(gram(tensor, mode=mode)), np.float64)
-        if not np.isfinite(square).all():
-            raise ValueError("the tensor must be finite, got NaN or infinity")
-        left = np.cumsum(np.maximum(square, 0))  # starting with the smallest
-        result.append(max(1, len(square) - int(np.searchsorted(left, error**2 / tensor.ndim * left[-1], "right"))))
-    return tuple(result)
 
 
 @jax.custom_jvp
@@ -223,25 +159,27 @@ def _slices(tensor: Array, mode: int) -> Array:
     return tensor.reshape(math.prod(shape[:mode]), shape[mode], math.prod(shape[mode + 1 :]))
 
 
-def _core(tensor: Array, factor: Sequence[Array], but: int | None = None) -> Array:
-    """The tensor times all factors, or all but one. Factors that shrink the tensor most come first."""
-    kept = {mode: each.shape[1] / each.shape[0] for mode, each in enumerate(factor) if mode != but}
-    for mode in sorted(kept, key=lambda mode: kept[mode]):
+def _core(tensor: Array, factor: Sequence[Array]) -> Array:
+    """The tensor times all factors. Factors that shrink the tensor most come first."""
+    for mode in sorted(range(len(factor)), key=lambda mode: factor[mode].shape[1] / factor[mode].shape[0]):
         tensor = multiply(tensor, factor[mode], mode=mode)
     return tensor
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
-def _dominant(matrix: Array, rank: int) -> Array:
-    """Leading eigenvectors of a positive semidefinite matrix, as columns."""
+def dominant(matrix: Float[Array, "m m"], rank: int) -> Float[Array, "m r"]:
+    """Leading eigenvectors of a positive semidefinite matrix, as columns.
+
+    Derivatives leave out rotations within the subspace that the vectors span.
+    """
     return eigen.symmetric(matrix, terms=rank)[1]
 
 
-@_dominant.defjvp
+@dominant.defjvp
 @partial(jit, static_argnums=0)
 def _dominant_jvp(rank, primal, tangent):
     (matrix,), (moved,) = primal, tangent
-    vector = _dominant(matrix, rank)
+    vector = dominant(matrix, rank)
     every, basis = jnp.linalg.eigh(matrix)
     # Rotations within the subspace are left out. The change of the subspace is a sum over the other eigenvectors.
     other, low = basis[:, : len(every) - rank], every[: len(every) - rank]

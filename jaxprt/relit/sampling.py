@@ -21,9 +21,10 @@ from jaxprt.relit.recipes import Known, Recipe, Target
 from jaxprt.scene import Environment, Mesh, Part
 from jaxprt.scene.mesh import frames
 from jaxprt.scene.points import Points, placed
-from jaxprt.systems import protocol, reference, separable
+from jaxprt.systems import protocol, reference
 from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.protocol import Blend, System
+from jaxprt.visibility import members
 
 MEMBERS = 225  # number of vertices in a cluster
 _CLUSTERS = 24  # number of measured clusters, of all parts together: errors differ much between clusters
@@ -111,7 +112,7 @@ class Sample:
         mesh = shading.mesh
         count = len(mesh.position)
         clusters = max(1, round(count / MEMBERS))
-        member = separable.members.cluster(mesh.position, mesh.normal, clusters=clusters)
+        member = members.cluster(mesh.position, mesh.normal, clusters=clusters)
         some = min(clusters, max(2, round(_CLUSTERS * count / total)))
         vertex = np.unique(member[np.random.default_rng(0).permutation(clusters)[:some]])
         start = time.perf_counter()

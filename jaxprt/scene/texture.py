@@ -35,7 +35,7 @@ def lookup(
         wrap: Wrap mode along u and along v, each one of ``WRAPS``.
 
     Returns:
-        Values of the image at the coordinates, for example weights for `separable.modulate`.
+        Values of the image at the coordinates, for example weights of a `jaxprt.Blend`.
 
     Raises:
         ValueError: The image has no axis of colors, coordinates are not pairs, or a wrap mode is unknown.

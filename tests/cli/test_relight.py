@@ -324,7 +324,7 @@ def test_parts_share_a_folder_and_a_call_without_one_goes_on_to_the_pictures(pla
     assert told[0].count("1 of its 1 blocks are missing: run the other parts") == 2
     assert "all parts are done: the same command without --part" in told[1]
     assert not (tmp_path / "report.json").exists()
-    monkeypatch.setattr(prt.separable.wavelets, "compress", None)  # Nothing is computed again.
+    monkeypatch.setattr(prt.separable.sparse, "compress", None)  # Nothing is computed again.
 
     def draw(*_):
         raise RuntimeError("it would draw")

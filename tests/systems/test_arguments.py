@@ -16,6 +16,9 @@ TABLE = HarmonicBrdf(jnp.ones((9, 1, 4)), (), jnp.zeros(()))
 MATRIX = TransferMatrix(jnp.ones((2, 1, 9, 9)), jnp.zeros((2, 3)), jnp.stack([jnp.eye(3)] * 2))
 VECTOR = TransferVector(jnp.ones((9, 1, 2)), jnp.zeros((2, 3)))
 POINT = jnp.zeros((2, 3))
+SPARSE = separable.SparseTransport(
+    jnp.zeros((1, 2, 1), jnp.uint16), jnp.ones((1, 2, 1, 1)), POINT, MATRIX.frame, jnp.ones(384)
+)
 MESH = builtin.plane(cells=1)
 WANTED = {
     "jaxprt.harmonic.project": [
@@ -33,8 +36,7 @@ WANTED = {
     ],
     "jaxprt.harmonic.precompute": [lambda: harmonic.radiance(VECTOR, TABLE, COEFFICIENT, eye=EYE)],
     "jaxprt.separable.factor": [
-        lambda: separable.radiance(None, MODEL, LIGHT, eye=EYE),
-        lambda: separable.view_tuple(None, MODEL, EYE),
+        lambda: separable.SeparableSystem(SPARSE, MODEL),
         lambda: dynamic.relight._check(0, None, MODEL, None, 2),
     ],
     "jaxprt.lobe.tabulate": [
@@ -43,8 +45,8 @@ WANTED = {
     ],
     "jaxprt.scene.load_environment": [
         lambda: harmonic.project(COEFFICIENT, degree=2),
-        lambda: separable.light_tuple(None, COEFFICIENT),
-        lambda: separable.project(COEFFICIENT),
+        lambda: separable.system.light_tuple(SPARSE, COEFFICIENT),
+        lambda: separable.system.project(COEFFICIENT),
         lambda: lobe.prefilter(COEFFICIENT),
         lambda: reference.radiance(MESH, MODEL, COEFFICIENT, eye=EYE),
         lambda: bright_texels.split(COEFFICIENT, count=3),

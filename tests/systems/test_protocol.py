@@ -134,11 +134,6 @@ def sparse(name: str, model: str) -> tuple[prt.System, Any]:
     return separable.SeparableSystem(transport, brdf), None
 
 
-def quantized(name: str, model: str) -> tuple[prt.System, Any]:
-    system, _ = sparse(name, model)
-    return separable.SeparableSystem(separable.quantized.quantize(system.transport), system.brdf), None
-
-
 def clustered(name: str, model: str) -> tuple[prt.System, Any]:
     brdf, visible = factored(model), seen(name)
     members = max(1, len(visible.position) // 24)
@@ -213,7 +208,6 @@ def total(name: str, model: str) -> tuple[prt.System, Any]:
 
 MADE = {
     "separable": Promise(sparse, 0.01, 0.1),
-    "separable, quantized": Promise(quantized, 0.01, 0.1),
     "separable, clustered": Promise(clustered, 0.02, 0.1),
     "harmonic": Promise(matrices, 0.02, 0.25),
     "harmonic, clustered": Promise(clustered_matrices, 0.02, 0.25),
@@ -888,7 +882,7 @@ def test_lights_of_two_or_four_colors_are_refused_by_number_where_the_materials_
 
 
 # The last test here: it forgets all programs, twice.
-@pytest.mark.parametrize("name", ["separable, quantized", "dynamic", "bounces"])  # They have all loops among them.
+@pytest.mark.parametrize("name", ["separable", "dynamic", "bounces"])  # They have all loops among them.
 def test_what_gpus_run_gives_the_same_radiance(name, request, close):
     case = made(name, "triangle")
     expected = shown(case, light())

@@ -43,8 +43,8 @@ def test_ranges_of_a_saved_transport_relight_to_the_rows_of_the_whole(sparse, br
     prt.files.save(tmp_path / "a.prt", sparse)
     mapped = prt.files.load(tmp_path / "a.prt")
     light = builtin.daylight(size=SIZE)
-    rows = pieces(mapped, lambda part: separable.radiance(part, brdf, light, eye=EYE))
-    whole = separable.radiance(sparse, brdf, light, eye=EYE)
+    rows = pieces(mapped, lambda part: prt.radiance(separable.SeparableSystem(part, brdf), light, eye=EYE))
+    whole = prt.radiance(separable.SeparableSystem(sparse, brdf), light, eye=EYE)
     np.testing.assert_allclose(np.concatenate(rows), whole, rtol=1e-5, atol=1e-6)
 
 

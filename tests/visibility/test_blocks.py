@@ -482,7 +482,7 @@ def test_a_store_opens_with_the_floats_that_another_processor_computes_and_not_w
     starts, frames = visibility.start_points, visibility.rays.frames
     monkeypatch.setattr(visibility.rays, "start_points", lambda *meshes, **options: rounded(starts(*meshes, **options)))
     monkeypatch.setattr(visibility.rays, "frames", lambda *each: rounded(frames(*each)))
-    monkeypatch.setattr(separable.wavelets, "compress", None)  # Nothing is computed again.
+    monkeypatch.setattr(separable.sparse, "compress", None)  # Nothing is computed again.
     other = eqx.tree_at(lambda b: b.light_map, brdf, jnp.asarray(rounded(brdf.light_map)))
     same(relit((mesh, other), path=path)[:2], expected[:2])
     again = prt.separable.factor(prt.brdf.AshikhminShirley(nu=10.5), terms=2, resolution=8)
@@ -490,7 +490,7 @@ def test_a_store_opens_with_the_floats_that_another_processor_computes_and_not_w
         ValueError, match=r"\(brdf: stored and given values differ by .* of the norm\).* jaxprt\.files\.save"
     ):
         relit((mesh, again), path=path)
-    monkeypatch.setattr(separable.wavelets.sparse, "ALGORITHM", {"visibility": 2, "separable": 2})
+    monkeypatch.setattr(separable.sparse, "ALGORITHM", {"visibility": 2, "separable": 2})
     with pytest.raises(
         ValueError, match=r"a\.prt was made by version .*'separable': 1}.*'separable': 2}.*other results"
     ):
@@ -517,7 +517,7 @@ def test_headers_of_all_traced_systems_name_versions_and_no_computed_float(spher
     more = {"region": np.zeros(156, int), "member": np.arange(156)[None], "white": white, "scale": white}
     more |= {"bases": (brdf,), "response": (np.ones((156, 6, 2), np.float32),), "components": 1}
     kinds = [
-        (separable.wavelets._Job, {"brdf": brdf, "keep": 3}),
+        (separable.sparse._Job, {"brdf": brdf, "keep": 3}),
         (visibility.stored._Job, {}),
         (lobe.pyramid._Job, {}),
         (harmonic.transfer._Job, {"degree": 1, "diffuse": False}),

@@ -15,13 +15,13 @@ from jaxtyping import Array, Float
 from jaxprt import require, visibility
 from jaxprt.compile import shared_size
 from jaxprt.scene.mesh import Mesh, areas
-from jaxprt.systems import separable
 from jaxprt.systems.bounces import functions, gather, jobs, patches
 from jaxprt.systems.bounces.patches import Patches
 from jaxprt.systems.bounces.tensor import SecondBounce, TransferTensor, scales, twice
 from jaxprt.systems.dynamic import DynamicBrdf
 from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.separable import SeparableBrdf
+from jaxprt.visibility import members
 from jaxprt.visibility.arguments import PRECOMPUTE
 
 ALL = "all"  # as many bounces as contribute
@@ -99,7 +99,7 @@ def precompute(
         os.makedirs(path, exist_ok=True)
     run = _Run(path, executor, progress)
     region = np.asarray(mesh.region)
-    member = separable.members.cluster(mesh.position, mesh.normal, clusters=max(1, round(len(region) / _MEMBERS)))
+    member = members.cluster(mesh.position, mesh.normal, clusters=max(1, round(len(region) / _MEMBERS)))
     parts = {
         "bases": bases,
         "response": _responses(mesh, bases, numbers, edge, lamps, run),
@@ -135,7 +135,7 @@ def precompute(
         worth += exchange.worth(made, job.white[function], function, brought_twice)
     if progress:
         _tell(contribution, function, worth, second, bounces)
-    rows = (separable.members.places(member), job.region.astype(np.int32), areas(mesh).astype(weight.dtype))
+    rows = (members.places(member), job.region.astype(np.int32), areas(mesh).astype(weight.dtype))
     arrays = [jax.device_put(each) for each in (weight, core, found["mode"], *rows, function)]
     judged = jnp.asarray(found["error"]), jnp.asarray(worth, arrays[0].dtype)
     made_of = {"factor": factor, "second": second, "mesh": visibility.blocks.scene_key(mesh), "patches": made}
@@ -193,7 +193,7 @@ class _Exchange(NamedTuple):
         found = self.run.compute(job, "patches", "patches")
         area = areas(self.mesh)
         mean = patches.Means(patch, area, len(of_region))
-        place = separable.members.places(member)
+        place = members.places(member)
         cosine = gather.cosines(self.job.frame[:, 2])
 
         def of_components(weight: np.ndarray) -> np.ndarray:
@@ -218,7 +218,7 @@ class _Exchange(NamedTuple):
 
     def worth(self, made: Patches, white: np.ndarray, function: np.ndarray, twice: np.ndarray) -> list[float]:
         """Worth of the bounces after the second: one value for each bounce, or one for all of them together."""
-        place = separable.members.places(self.job.member)
+        place = members.places(self.job.member)
         mean = patches.Means(np.asarray(made.patch), areas(self.mesh), len(made.region))
         rho = np.asarray(made.albedo(jnp.asarray(function), jnp.asarray(white[:, None], made.light.dtype)))
         start = rho * mean.of(twice[place][:, None]).astype(rho.dtype)

@@ -16,9 +16,9 @@ from jaxprt.compile import jit, shared_size
 from jaxprt.decompose import eigen, tucker
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.sphere import cubemap, haar
-from jaxprt.systems import separable
 from jaxprt.systems.bounces import gather
-from jaxprt.systems.separable import SeparableBrdf
+from jaxprt.systems.separable import SeparableBrdf, clustered
+from jaxprt.visibility import members
 
 # Versions of the algorithms that make the results. A release that changes results increments one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "transfer": 2}
@@ -59,7 +59,7 @@ class ResponseJob(visibility.rays.VisibilityJob):
 
 
 @dataclass(frozen=True)
-class _PathJob(separable.members.ClusterJob, visibility.rays.VisibilityJob):
+class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
     """Light that surfaces of all regions send to the vertices of each cluster; see `blocks.Job`.
 
     Attributes:
@@ -322,7 +322,7 @@ def compress(
     """
     count, texels, kinds = tensor.shape
     size = haar.face_edge(texels)
-    importance = jnp.tile(haar.area(size=size).ravel(), 6)[:, None] ** separable.clustered.SPECTRUM
+    importance = jnp.tile(haar.area(size=size).ravel(), 6)[:, None] ** clustered.SPECTRUM
     wavelet = haar.forward(tensor.reshape(count, 6, size, size, kinds))
     tensor = wavelet.reshape(count, texels, kinds) * importance.astype(tensor.dtype)
     whole = jnp.vdot(tensor, tensor)

@@ -30,8 +30,8 @@ from jaxprt.files.arrays import Layout
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh, areas
 from jaxprt.sphere import cubemap
-from jaxprt.systems import separable
 from jaxprt.systems.bounces import gather
+from jaxprt.visibility import members
 
 MOST = 0.9999  # largest albedo in the sum of all bounces, which must converge in a closed room
 LEAST = 2  # smallest average number of vertices of a patch
@@ -328,12 +328,12 @@ def divide(
     Returns:
         The patch of each vertex, and the region and the cluster of each patch.
     """
-    coordinate = separable.members.coordinates(position, normal)
+    coordinate = members.coordinates(position, normal)
     patch, of_region, of_cluster = np.zeros(len(region), np.int32), [], []
-    for number, members in enumerate(member):
-        members = np.unique(members)
-        for each in np.unique(region[members]).tolist():
-            own = members[region[members] == each]
+    for number, vertex in enumerate(member):
+        vertex = np.unique(vertex)
+        for each in np.unique(region[vertex]).tolist():
+            own = vertex[region[vertex] == each]
             count = min(len(own), max(1, round(patches * len(own) / len(region))))
             for part in clustering.bisect(coordinate[own], clusters=count):
                 patch[own[part]] = len(of_region)

@@ -1,8 +1,7 @@
 """The dynamic system: direct light, with materials that can change at run time (Sun et al. 2007)."""
 
-from jaxprt.systems.dynamic import brdf_set, published, reflected, relight, system, transport
+from jaxprt.systems.dynamic import brdf_set, reflected, relight, system, transport
 from jaxprt.systems.dynamic.brdf_set import DynamicBrdf, Mixed, factor, separate
-from jaxprt.systems.dynamic.published import factor_tensor
 from jaxprt.systems.dynamic.relight import (
     DynamicLight,
     DynamicView,
@@ -30,11 +29,9 @@ __all__ = [
     "brdf_set",
     "combine",
     "factor",
-    "factor_tensor",
     "light_side",
     "mix",
     "precompute",
-    "published",
     "radiance",
     "reflected",
     "relight",

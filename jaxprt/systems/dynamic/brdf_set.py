@@ -151,7 +151,7 @@ def separate(brdfs: Sequence[Callable], *, lobes: int = 8, separator: Callable |
         brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr, either all isotropic or all anisotropic.
         lobes: Number of free lobes that `jaxprt.lobe.tabulate` fits to each BRDF.
         separator: Function from a BRDF to its table, in place of that fit. The published form is
-            `jaxprt.lobe.published.mirror_lobes`.
+            `mirror_lobes` in `benchmarks/published/lobes.py`.
 
     Raises:
         ValueError: There are no BRDFs, some are isotropic and some are not, or for the reasons that
@@ -193,7 +193,7 @@ def factor(
     The decomposed tensor holds the light that each BRDF reflects to each view from each spherical harmonic, weighted by
     the natural power spectrum. This minimizes the squared error of pictures, as in `jaxprt.separable.factor`, even with
     sharp peaks. Maps are parabolic. Light maps are limited to the bandwidth of the harmonics. For the published norm
-    and maps, use `jaxprt.dynamic.published.factor_tensor`.
+    and maps, see `factor_tensor` in `benchmarks/published/tensors.py`.
 
     Args:
         brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr on local directions, without diffuse parts.

@@ -21,11 +21,12 @@ from jaxprt import require
 from jaxprt.compile import isolated, jit
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
-from jaxprt.systems import bright_texels, lobe, protocol, separable
+from jaxprt.systems import bright_texels, lobe, protocol
 from jaxprt.systems.dynamic.brdf_set import DynamicBrdf, Mixed
 from jaxprt.systems.dynamic.transport import DynamicTransport, RegionTransport
 from jaxprt.systems.lobe import LobeLight, LobeView
 from jaxprt.systems.separable import SeparableBrdf
+from jaxprt.systems.separable import system as separable
 from jaxprt.systems.separable.factorization import check_mark
 from jaxprt.visibility.points import PointVisibility
 
@@ -218,10 +219,10 @@ def _view_side(transport: DynamicTransport, brdfs, materials, eye: Array, points
         brdf = surface.brdf
         place = placed(own.seen.position, own.seen.frame, at)
         if isinstance(brdf, SeparableBrdf):
-            region.append(RegionView(surface, separable.view_factors(brdf, *place, eye), None, at))
+            region.append(RegionView(surface, separable.view_tuple(brdf, *place, eye), None, at))
             continue
         looked = None if brdf.lobe is None else lobe.view_lobes(own.seen, brdf.lobe, eye=eye, points=at)
-        factor = separable.view_factors(brdf.terms, *place, eye) if brdf.terms.terms else None
+        factor = separable.view_tuple(brdf.terms, *place, eye) if brdf.terms.terms else None
         region.append(RegionView(surface, factor, looked, at))
     return DynamicView(eye, tuple(region))
 

@@ -26,7 +26,7 @@ from jaxprt.decompose import eigen
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.files.mapped import Reference, reference
 from jaxprt.sphere import haar
-from jaxprt.systems.separable import wavelets
+from jaxprt.systems.separable import sparse
 from jaxprt.systems.separable.factorization import SeparableBrdf, marked
 from jaxprt.visibility import StoredVisibility, members
 
@@ -103,7 +103,7 @@ class ClusteredTransport(eqx.Module):
         """Multiplies the transport by the light: one product per BRDF term and vertex.
 
         Args:
-            coefficient: Haar coefficients of the light, from `jaxprt.separable.project`.
+            coefficient: Haar coefficients of the light, from `jaxprt.separable.system.project`.
 
         Returns:
             The light-modulated tuple of Wang et al., in units of radiance.
@@ -277,7 +277,7 @@ def compress(
 
     def transport(argument):
         visible, axes = argument
-        return wavelets.project(visible[None], axes[None], brdf)[0, ..., 0]
+        return sparse.project(visible[None], axes[None], brdf)[0, ..., 0]
 
     stride = max(1, len(seen) // _SAMPLE)
     sample = jax.lax.map(lambda a: jnp.sum(transport(a) ** 2, 1), (seen[::stride], frame[::stride]))

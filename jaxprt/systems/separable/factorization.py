@@ -1,8 +1,9 @@
-"""Factored BRDFs: sums of products of a light map and a view map, f(wi, wo) = sum_r g_r(wi) h_r(wo)."""
+"""Factored BRDFs: sums of products of a light map and a view map, f(wi, wo) = sum_r g_r(wi) h_r(wo); their errors."""
 
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -17,8 +18,7 @@ from jaxprt.compile import isolated, jit
 from jaxprt.decompose import eigen
 from jaxprt.files import objects
 from jaxprt.scene.environment import Environment
-from jaxprt.sphere import harmonics, hemisphere
-from jaxprt.systems.separable import errors
+from jaxprt.sphere import cubemap, directions, harmonics, hemisphere
 
 _DEGREE = 36  # of the light prior; maps of 48 x 48 texels resolve nothing finer
 _MOST_TERMS = 256
@@ -240,7 +240,7 @@ def _factor_for(brdf: Callable, light: Sequence[Environment], terms: int | None,
     count, most = 4, min(_MOST_TERMS, int(jnp.sum(hemisphere.parabolic_texel_area(resolution=resolution) > 0)))
     while True:
         found = factor(brdf, terms=count, resolution=resolution)
-        reached = np.max([errors.light_errors(brdf, found, each) for each in light], 0)
+        reached = np.max([light_errors(brdf, found, each) for each in light], 0)
         good = np.flatnonzero(reached <= error)
         if good.size:
             kept = found.truncate(int(good[0]) + 1)
@@ -251,36 +251,76 @@ def _factor_for(brdf: Callable, light: Sequence[Environment], terms: int | None,
         count = min(4 * count, most)
 
 
-def join(brdfs: Sequence[SeparableBrdf]) -> SeparableBrdf:
-    """Concatenates the terms of several factored BRDFs, so that one transport serves every weighted sum of them.
+@runtime_checkable
+class Terms(Protocol):
+    """A BRDF given by a light factor and a view factor for each term, such as `jaxprt.separable.SeparableBrdf`."""
 
-    `jaxprt.separable.modulate` applies the weights.
+    def light(self, wi: Float[Array, "*b 3"]) -> Float[Array, "*b r l"]:
+        """Light factors of all terms r, gray or per color l."""
+        ...
+
+    def view(self, wo: Float[Array, "*b 3"]) -> Float[Array, "*b r c"]:
+        """View factors of all terms r, per color c."""
+        ...
+
+
+def light_errors(
+    brdf: Callable, factored: Terms, light: Environment, *, frames: int = 32, views: int = 32
+) -> Float[Array, " r"]:
+    """Relative L2 error of radiance reflected under a light, without shadows, for each number of terms.
+
+    Normals are spread evenly over the sphere, and views over the hemisphere. The BRDF and its terms are both sampled at
+    the centers of the light's texels, so the error is that of the factorization only.
 
     Args:
-        brdfs: One or more factored BRDFs with the same map coordinates and resolution. Gray ones are repeated to the
-            number of colors of the others.
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions.
+        factored: The factored BRDF.
+        light: One environment.
+        frames: Number of normals.
+        views: Number of views for each normal.
 
     Returns:
-        The sum of the BRDFs: the terms of the first, then those of the next. Its error is unknown and set to NaN.
+        Error of the first term, of the first two terms, and so on. Zero if all radiance is zero.
 
     Raises:
-        ValueError: There are no BRDFs, or their maps differ in coordinates or resolution.
-
-    Reference: Wang, Tran, Luebke 2004, section 3.1, which mentions linear combinations of basis BRDFs.
+        ValueError: The light is a batch.
     """
-    kinds = sorted({f"{b.light_map.shape[1]} x {b.light_map.shape[2]} {b.coordinates.__name__}" for b in brdfs})
-    if len(kinds) != 1:
-        raise ValueError(
-            f"brdfs must be at least one, all with maps of the same resolution and coordinates, "
-            f"got {', '.join(kinds) or 'none'}"
-        )
+    if light.radiance.ndim != 4:
+        raise ValueError(f"the light must be one environment [6, n, n, c], got {list(light.radiance.shape)}")
+    return _light_errors(jax.tree_util.Partial(brdf), factored, light, _spread(frames, -1), _spread(views, 0))
 
-    def side_by_side(maps):
-        colors = max(each.shape[-1] for each in maps)
-        return jnp.concatenate([jnp.broadcast_to(each, (*each.shape[:-1], colors)) for each in maps])
 
-    light_map, view_map = (side_by_side([getattr(b, name) for b in brdfs]) for name in ("light_map", "view_map"))
-    return SeparableBrdf(light_map, view_map, jnp.full_like(brdfs[0].error, jnp.nan), brdfs[0].coordinates)
+@jit
+def _light_errors(brdf: Callable, factored: Terms, light: Environment, normal: Array, view: Array) -> Array:
+    size = light.radiance.shape[1]
+    direction, area = (each(size=size).reshape(-1, 3) for each in (cubemap.direction, cubemap.vector_area))
+    table = light.radiance.reshape(len(direction), -1)
+    factor = factored.view(view)
+
+    def one(axes):
+        wi = directions.to_local(axes, direction)
+        received = table * jnp.maximum(directions.to_local(axes, area)[:, 2:], 0)
+        met = jnp.einsum("drl,dc->rlc", factored.light(wi), received)
+        met = met[:, 0] if met.shape[1] == 1 else jnp.einsum("rcc->rc", met)
+        by_terms = jnp.cumsum(factor * met, 1)
+
+        def exact(wo):
+            return jnp.sum(brdf(wi, jnp.broadcast_to(wo, wi.shape)) * received, 0)
+
+        true = jax.lax.map(exact, view)
+        return jnp.sum((by_terms - true[:, None]) ** 2, (0, 2)), jnp.sum(true**2)
+
+    error, whole = jax.lax.map(one, directions.frame(normal, jnp.zeros_like(normal)))
+    whole = jnp.sum(whole)
+    return jnp.sqrt(jnp.sum(error, 0) / jnp.where(whole > 0, whole, 1))
+
+
+def _spread(count: int, lowest: int) -> Array:
+    """Directions with z above `lowest`, spread evenly on a golden spiral."""
+    height = 1 - (1 - lowest) * (np.arange(count) + 0.5) / count
+    turn = np.pi * (1 + np.sqrt(5)) * np.arange(count)
+    radius = np.sqrt(1 - height**2)
+    return jnp.asarray(np.stack([radius * np.cos(turn), radius * np.sin(turn), height], -1), jnp.result_type(float))
 
 
 def tabulate(brdf: Callable, direction: Float[Array, "d 3"]) -> Float[Array, "c d d"]:

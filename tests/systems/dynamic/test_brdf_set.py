@@ -195,25 +195,6 @@ def test_colors_of_a_set_are_members_of_their_own(pairs):
     np.testing.assert_allclose(found, np.broadcast_to(np.array([0.55, 0.25, 0.45]) / np.pi, found.shape), rtol=0.025)
 
 
-def test_published_tensor_is_exact_at_full_rank():
-    table = dynamic.published.factor_tensor(SET, ranks=(3, 40, 40), resolution=8)
-    direction = np.asarray(hemisphere.texel_direction(resolution=8)).reshape(-1, 3)
-    inside = np.flatnonzero(hemisphere.texel_area(resolution=8))[8:30]
-    wi = np.broadcast_to(direction[inside][:, None], (22, 22, 3))
-    for number, brdf in enumerate(SET):
-        found = mixed_value(table, np.eye(3, dtype=np.float32)[number], wi, wi.swapaxes(0, 1))
-        assert relative(found, value(brdf, wi, wi.swapaxes(0, 1))) < 0.013
-    assert table.error < 6e-3
-
-
-def test_published_lobes_leave_what_a_tensor_can_carry():
-    lobes = dynamic.separate(SET, separator=lambda b: lobe.published.mirror_lobes(b, resolution=4))
-    assert lobes.scale.shape[:2] == (4, 3)
-    with_lobes = dynamic.factor(SET, lobes, ranks=(3, 16, 16), resolution=RESOLUTION)
-    without = dynamic.factor(SET, None, ranks=(3, 16, 16), resolution=RESOLUTION)
-    assert with_lobes.error < without.error
-
-
 def test_lobes_alone_take_more_directions_than_a_block_has(lobes, pairs, monkeypatch):
     member = dynamic.factor(SET, lobes).at(jnp.array([0.2, 0.3, 0.5]))
     whole = value(member, *pairs)
@@ -274,20 +255,10 @@ def test_derivatives_by_weights(lobes, pairs):
         (lambda _: dynamic.factor(SET, None, ranks=(0, 1, 1), resolution=8), "from 1"),
         (lambda _: dynamic.factor(SET, None, ranks=(1, 1, 1), resolution=2), "resolution must be at least 4"),
         (lambda _: dynamic.factor(SET, None, ranks=(1, 1, 1), resolution=0), "resolution must be at least 4"),
-        (
-            lambda _: dynamic.published.factor_tensor(SET, ranks=(1, 1, 1), resolution=0),
-            "resolution must be at least 4",
-        ),
         (lambda _: dynamic.factor([SET[0], Lambert([1.0, 0, 0])], None, ranks=(1, 1, 1)), r"\[b 1\], or all to"),
         (
             lambda _: dynamic.factor([SET[0], lambda wi, wo: -wi[:, 2:]], None, ranks=(1, 1, 1), resolution=8),
             "1 of 2 BRDFs that are not, the first is number 1",
-        ),
-        (
-            lambda _: dynamic.published.factor_tensor(
-                [SET[0], lambda wi, wo: wi[:, 2:] * jnp.nan], ranks=(1, 1, 1), resolution=8
-            ),
-            "finite",
         ),
         (
             lambda each: dynamic.separate(

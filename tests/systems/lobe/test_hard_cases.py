@@ -12,7 +12,6 @@ from jaxprt.brdf import AshikhminShirley, BlinnPhong, CookTorrance
 from jaxprt.scene import Environment
 from jaxprt.sphere import cubemap, hemisphere
 from jaxprt.systems.lobe import LobeTransport
-from jaxprt.systems.lobe.published import mirror_lobes
 
 RESOLUTION = 8
 ENERGY = 2e-3  # At nodes: another quadrature, and what the horizon cuts of a lobe.
@@ -118,9 +117,8 @@ def test_views_at_the_normal_and_at_the_horizon_are_finite(tables, name):
     np.testing.assert_allclose(jnp.linalg.norm(found.mean, axis=0), 1, rtol=1e-5)
     wi, wo = (jnp.asarray(each) for each in (np.repeat(EXTREME, len(EXTREME), 0), np.tile(EXTREME, (len(EXTREME), 1))))
     lit = np.asarray((wi[:, 2] > 0) & (wo[:, 2] > 0))
-    for brdf in (table, lobe.Remainder(BRDF[name], table)):
-        assert np.isfinite(np.asarray(value(brdf, wi, wo))).all()
     actual = np.asarray(value(table, wi, wo))
+    assert np.isfinite(actual).all()
     assert np.all(actual >= 0)
     np.testing.assert_array_equal(actual[~lit], 0)
     assert np.isfinite(np.asarray(slope(table, EXTREME))).all()
@@ -146,15 +144,6 @@ def test_a_mirror_has_no_diffuse_part_and_its_lobes_are_the_finest_in_its_direct
     mean = np.sum(found.mean * np.asarray(found.weight), 1) / np.sum(found.weight, 1)
     # Between nodes a mean is on the chord, of 20 degrees, not on the arc.
     np.testing.assert_allclose(mean.T, lobe.em.mirror(wo), atol=0.01)
-
-
-@pytest.mark.parametrize(("name", "glossy"), [("zero", 0), ("mirror", 1)])
-def test_published_lobes_of_a_mirror_are_the_sharpest_and_of_nothing_nothing(name, glossy):
-    table = mirror_lobes(BRDF[name], resolution=RESOLUTION)
-    assert all(np.isfinite(np.asarray(leaf)).all() for leaf in (table.mean, table.scale, table.weight))
-    whole = np.sum(table.weight[0], 0)
-    np.testing.assert_allclose(table.weight[0, 0], whole, rtol=0.01)
-    assert np.all((whole > 0) == glossy)
 
 
 SIZE = 16

@@ -1,4 +1,4 @@
-"""BRDFs as tables of lobes: their errors, energy, frames and parameters, and the published lobes."""
+"""BRDFs as tables of lobes: their errors, energy, frames and parameters."""
 
 import functools
 
@@ -12,7 +12,6 @@ import scipy.stats
 from jaxprt import lobe
 from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert, MetallicRoughness
 from jaxprt.sphere import hemisphere
-from jaxprt.systems.lobe.published import mirror_lobes
 
 RESOLUTION = 8
 ENERGY = 2e-3  # The plane of the horizon cuts a wide lobe by a sum over its samples, in float32.
@@ -259,14 +258,6 @@ def test_brighter_brdfs_have_weights_as_much_larger(quick, close):
     close(bright.scale, dark.scale, tolerance=EM)
 
 
-def test_lobes_and_their_remainder_are_the_brdf(quick, close):
-    table, wi, wo = quick("anisotropic"), upper(6, 300, least=0.01), upper(7, 300)
-    rest = lobe.Remainder(COLORED, table)
-    close(np.asarray(value(rest, wi, wo)) + value(table, wi, wo) / np.asarray(wi)[:, 2:], value(COLORED, wi, wo))
-    grazing = directions((np.pi / 2 - 1e-6, 0.3), (np.pi / 2, 0.1))
-    assert np.isfinite(np.asarray(value(rest, grazing, np.asarray(wo)[:2]))).all()
-
-
 def test_views_and_light_below_the_horizon_give_nothing(quick):
     below = directions((1.6, 0.0), (3.0, 2.0), (np.pi, 0.0))
     for table in (quick("glossy"), quick("anisotropic")):
@@ -445,50 +436,3 @@ def test_a_wrong_number_of_parameters_is_refused(quick):
         quick("varying", resolution=4).at()
     with pytest.raises(ValueError, match="the table needs 1 parameters for each view, or `at` to choose"):
         quick("varying", resolution=4).lookup(upper(0, 2))
-
-
-def mirror_lobe(degrees, weight):
-    """A BRDF whose product with the cosine is Gaussian lobes around the mirror direction."""
-
-    def brdf(wi, wo):
-        away = jnp.sum((wi - lobe.em.mirror(wo)) ** 2, -1, keepdims=True) / 2
-        k = 1 / (np.radians(np.array(degrees)) / 3) ** 2
-        density = jnp.exp(-k * away) * (k / (2 * np.pi))
-        return jnp.sum(density * np.array(weight), -1, keepdims=True) / jnp.maximum(wi[..., 2:], 1e-6)
-
-    return brdf
-
-
-def test_published_lobes_are_in_the_mirror_direction_and_have_the_given_widths():
-    table = mirror_lobes(GLOSSY, angles=(0.0, 7.0, 21.0), resolution=RESOLUTION)
-    expected = np.array([lobe.em.FINEST, *(1 / (np.radians([7, 21]) / 3) ** 2)])
-    np.testing.assert_allclose(jnp.exp(table.scale), np.outer(expected, np.ones(RESOLUTION)), rtol=1e-4)
-    np.testing.assert_array_equal(table.diffuse, 0)
-    wo = nodes()
-    found = table.lookup(wo).mean
-    np.testing.assert_allclose(found, np.asarray(lobe.em.mirror(wo)).T[:, None] * np.ones((3, 3, 1)), atol=1e-6)
-
-
-@pytest.mark.parametrize("weight", [[0.5, 0, 0], [0, 0.3, 0], [0.2, 0, 0.6]])
-def test_published_lobes_find_a_brdf_that_is_such_lobes_also_where_the_horizon_cuts_them(weight):
-    angles = (3.0, 7.0, 21.0)
-    table = mirror_lobes(mirror_lobe(angles, weight), angles=angles, resolution=RESOLUTION)
-    # The other lobes part from these as EM goes on.
-    np.testing.assert_allclose(table.weight[0], np.outer(weight, np.ones(RESOLUTION)), atol=0.01)
-
-
-def test_published_lobes_of_anisotropic_brdfs_are_maps_with_colors():
-    table = mirror_lobes(COLORED, resolution=8)
-    assert table.weight.shape == (3, 4, 4, 4)
-    assert not table.isotropic
-
-
-@pytest.mark.parametrize("angles", [(), (7.0, -1.0)])
-def test_published_lobes_need_angles(angles):
-    with pytest.raises(ValueError, match="angles must be at least one, none below 0, got"):
-        mirror_lobes(GLOSSY, angles=angles)
-
-
-def test_published_lobes_refuse_brdfs_that_are_negative():
-    with pytest.raises(ValueError, match="must be finite and not negative"):
-        mirror_lobes(flat(-0.5), resolution=4)

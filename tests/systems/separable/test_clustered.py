@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxprt as prt
 from jaxprt import separable, visibility
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.scene import builtin
@@ -16,7 +17,8 @@ from jaxprt.scene.mesh import join
 from jaxprt.sphere import directions, haar
 from jaxprt.systems.separable import SeparableBrdf, factor
 from jaxprt.systems.separable.clustered import precompute
-from jaxprt.systems.separable.wavelets import project
+from jaxprt.systems.separable.sparse import project
+from jaxprt.visibility import members
 from jaxprt.visibility.members import cluster
 
 SIZE = 8
@@ -27,6 +29,10 @@ WHOLE = {"clusters": CLUSTERS, "components": 10, "modes": 30, "keep": ALL}
 SMALL = {"clusters": CLUSTERS, "components": 4, "modes": 8, "keep": 100}
 HALF = 2e-3  # Numbers of half precision have 11 bits: modes and cores lose 5e-4 each; measured 3e-4 together.
 EYE = jnp.array([1.0, 2.0, 3.0])
+
+
+def relight(transport, brdf, light):
+    return prt.radiance(separable.SeparableSystem(transport, brdf), light, eye=EYE)
 
 
 @pytest.fixture
@@ -124,13 +130,15 @@ def test_all_components_modes_and_coefficients_are_the_uncompressed_transport(wh
 def expected(seen, brdf):
     """Radiance under daylight by uncompressed transport."""
     level = jnp.asarray(seen.seen(np.arange(VERTICES)))
-    met = np.einsum("vdrl,dc->vrc", project(level, seen.frame, brdf), separable.project(builtin.daylight(size=SIZE)))
+    met = np.einsum(
+        "vdrl,dc->vrc", project(level, seen.frame, brdf), separable.system.project(builtin.daylight(size=SIZE))
+    )
     return np.sum(met * np.asarray(brdf.view(directions.view(seen.frame, seen.position, EYE))), 1)
 
 
 def test_all_of_it_lights_as_uncompressed_transport_does(whole, brdf, expected, close):
     light = builtin.daylight(size=SIZE)
-    close(separable.radiance(whole, brdf, light, eye=EYE), expected, tolerance=HALF)
+    close(relight(whole, brdf, light), expected, tolerance=HALF)
     assert np.count_nonzero(expected.any(1)) > 10
 
 
@@ -235,7 +243,7 @@ def test_slopes_by_stored_numbers_are_finite(small, brdf):
     light = builtin.daylight(size=SIZE)
 
     def total(transport):
-        return jnp.sum(separable.radiance(transport, brdf, light, eye=EYE))
+        return jnp.sum(relight(transport, brdf, light))
 
     slope = eqx.filter_grad(total)(small)
     assert all(np.isfinite(np.asarray(each)).all() for each in jax.tree.leaves(slope))
@@ -247,17 +255,7 @@ def test_rows_are_vertices_by_cluster_and_everything_that_is_given_is_in_the_ord
     np.testing.assert_array_equal(whole.vertex[whole.place], np.arange(VERTICES))
     assert not np.array_equal(whole.vertex[:VERTICES], np.arange(VERTICES))
     same((whole.position, whole.frame), (seen.position, seen.frame))
-    assert isinstance(whole, separable.Transport)
-
-
-def test_tuples_and_weights_of_a_texture_are_in_the_order_of_the_mesh(whole, brdf, expected, random, close):
-    """As README shows them: one side changes, the other is kept."""
-    light = builtin.daylight(size=SIZE)
-    lit, view = separable.light_tuple(whole, light), separable.view_tuple(whole, brdf, EYE)
-    close(separable.combine(lit, view), expected, tolerance=HALF)
-    texture = random.uniform(size=(VERTICES, 1, 3)).astype(np.float32)
-    painted = separable.modulate(view, jnp.asarray(texture), terms=(TERMS,))
-    close(separable.combine(lit, painted), expected * texture[:, 0], tolerance=HALF)
+    assert isinstance(whole, separable.system.Transport)
 
 
 def test_numbering_the_vertices_anew_numbers_the_radiance(whole, mesh, brdf, random, close):
@@ -267,8 +265,8 @@ def test_numbering_the_vertices_anew_numbers_the_radiance(whole, mesh, brdf, ran
     shuffled = jax.tree.map(lambda each: each[order] if len(each) == VERTICES else each, mesh)
     shuffled = eqx.tree_at(lambda m: m.face, shuffled, jnp.asarray(number[np.asarray(mesh.face)], jnp.int32))
     again = precompute(visibility.precompute(shuffled, size=SIZE, progress=False), brdf, progress=False, **WHOLE)
-    expected = separable.radiance(whole, brdf, light, eye=EYE)[order]
-    close(separable.radiance(again, brdf, light, eye=EYE), expected, tolerance=2 * HALF)
+    expected = relight(whole, brdf, light)[order]
+    close(relight(again, brdf, light), expected, tolerance=2 * HALF)
 
 
 def test_clusters_join_what_lies_and_faces_alike(random):
@@ -374,9 +372,9 @@ def test_brdfs_without_shared_light_maps_are_refused(seen):
 def test_other_brdfs_and_lights_than_it_was_made_for_are_refused(small, brdf):
     light = builtin.daylight(size=SIZE)
     with pytest.raises(ValueError, match="the BRDF must have the transport's 3 terms, got 2"):
-        separable.radiance(small, SeparableBrdf(brdf.light_map[:2], brdf.view_map[:2], brdf.error), light, eye=EYE)
+        relight(small, SeparableBrdf(brdf.light_map[:2], brdf.view_map[:2], brdf.error), light)
     with pytest.raises(ValueError, match=r"the light must be one environment \[6, 8, 8, c\], got \[6, 4, 4, 3\]"):
-        separable.radiance(small, brdf, builtin.daylight(size=4), eye=EYE)
+        relight(small, brdf, builtin.daylight(size=4))
     with pytest.raises(ValueError, match="the light's coefficients must be 384, got 96"):
         small.apply(jnp.ones((96, 3)))
 
@@ -387,13 +385,13 @@ def test_tuples_of_other_terms_vertices_or_colors_are_not_combined(shape):
     """Terms that one side lacks were left out, without a word."""
     for light, view in (((7, 3, 3), shape), (shape, (7, 3, 3))):
         with pytest.raises(ValueError, match="light and view must have the same vertices, terms and colors, got"):
-            separable.combine(jnp.ones(light), jnp.ones(view))
+            separable.system.combine(jnp.ones(light), jnp.ones(view))
 
 
 @pytest.mark.parametrize("colors", [(1, 1), (1, 3), (3, 1), (3, 3)])
 def test_tuples_are_combined_color_by_color(random, close, colors):
     light, view = (random.normal(size=(7, TERMS, each)) for each in colors)
-    found = separable.combine(*(jnp.asarray(each, jnp.float32) for each in (light, view)))
+    found = separable.system.combine(*(jnp.asarray(each, jnp.float32) for each in (light, view)))
     close(found, np.sum(light * view, 1))
 
 
@@ -427,21 +425,21 @@ def test_fewer_terms_know_their_brdf_and_refuse_others(seen, brdf, small):
     light = builtin.daylight(size=SIZE)
     other = factor(Lambert(0.5), terms=TERMS, resolution=12)
     fewer = small.truncate(terms=2)
-    assert np.isfinite(separable.radiance(fewer, brdf.truncate(2), light, eye=EYE)).all()
+    assert np.isfinite(relight(fewer, brdf.truncate(2), light)).all()
     for transport, wrong in ((small, other), (fewer, other.truncate(2))):
         with pytest.raises(ValueError, match="must be the one that the transport was made for, got another"):
-            separable.radiance(transport, wrong, light, eye=EYE)
+            relight(transport, wrong, light)
 
 
 def test_clusters_grow_with_the_root_of_the_vertices_and_sizes_fit_any_mesh(brdf):
-    assert [separable.members.clusters_for(count) for count in (1, 3, 100, 36_000, 1_000_000)] == [1, 1, 8, 159, 840]
+    assert [members.clusters_for(count) for count in (1, 3, 100, 36_000, 1_000_000)] == [1, 1, 8, 159, 840]
     triangle = visibility.precompute(builtin.plane(cells=1), size=2, progress=False)
     few = precompute(triangle, brdf, progress=False)
     assert (few.core.shape[2], few.index.shape) == (2, (2, 24))
     light = builtin.daylight(size=2)
     exact = project(jnp.asarray(triangle.seen(np.arange(4))), triangle.frame, brdf)[..., 0]
-    expected = np.einsum("vdr,dc->vrc", exact, separable.project(light))
-    np.testing.assert_allclose(few.apply(separable.project(light)), expected, atol=3e-3 * np.abs(expected).max())
+    expected = np.einsum("vdr,dc->vrc", exact, separable.system.project(light))
+    np.testing.assert_allclose(few.apply(separable.system.project(light)), expected, atol=3e-3 * np.abs(expected).max())
 
 
 def test_jobs_send_mapped_visibility_by_the_name_of_its_file(brdf, tmp_path):

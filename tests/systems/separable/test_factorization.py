@@ -8,7 +8,7 @@ from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert
 from jaxprt.brdf.varying import Channels
 from jaxprt.scene import Environment
 from jaxprt.sphere import hemisphere
-from jaxprt.systems.separable import light_errors, sample_error
+from jaxprt.systems.separable import light_errors
 
 WANG = AshikhminShirley(diffuse=0.5, specular=0.75, nu=10, nv=100)
 
@@ -137,10 +137,6 @@ def test_black_brdf_gives_zero_without_nan():
     assert separable.factor(Lambert(0.0), error=0.1, resolution=8).error == 0
 
 
-def _constant(value):
-    return lambda wi, wo: jnp.full((*wi.shape[:-1], 1), value) * jnp.ones_like(wi)
-
-
 def test_terms_chosen_for_a_light_meet_the_error_under_it_and_the_prior_alone_does_not():
     sun = Environment(jnp.full((6, 8, 8, 3), 0.1).at[2, 3, 5].set(30.0))
     brdf = AshikhminShirley(nu=10, nv=10)
@@ -156,26 +152,6 @@ def test_terms_chosen_for_a_light_meet_the_error_under_it_and_the_prior_alone_do
         ValueError, match=r"lights must be at least one, and error must be given with them, got 1 lights and terms=3"
     ):
         separable.factor(brdf, terms=3, light=[sun])
-
-
-def test_sample_error_of_closed_forms():
-    error, relative = sample_error(_constant(0.5), _constant(0.3))
-    np.testing.assert_allclose([error, relative], [0.2, 0.4], rtol=1e-5)
-    # sqrt(mean of cos_i^3 / mean of cos_i) = sqrt(1/2), and views weigh alike: sqrt(mean of cos_o^2) = sqrt(1/3).
-    samples = 5e-3
-    incident = sample_error(lambda wi, wo: wi[..., 2:], _constant(0.0))
-    assert incident[0] == pytest.approx(np.sqrt(0.5), rel=samples)
-    assert incident[1] == pytest.approx(1)
-    view = sample_error(lambda wi, wo: wo[..., 2:], _constant(0.0))
-    assert view[0] == pytest.approx(np.sqrt(1 / 3), rel=samples)
-
-
-def test_sample_error_is_the_same_at_each_call_and_finite_for_nothing():
-    first, second = (sample_error(WANG, _constant(0.0), samples=1000) for _ in range(2))
-    assert first == second
-    assert sample_error(_constant(0.0), _constant(0.0), samples=1000) == (0, 0)
-    with pytest.raises(ValueError, match="samples must be at least 1, got 0"):
-        sample_error(WANG, WANG, samples=0)
 
 
 def test_factoring_again_with_other_rounding_finds_the_same_factors_in_the_same_order_and_signs():

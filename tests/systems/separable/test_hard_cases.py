@@ -13,8 +13,8 @@ from jaxprt.scene.environment import environment_from_image
 from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.sphere import directions
 from jaxprt.systems.separable import SeparableBrdf, factor, precompute
-from jaxprt.systems.separable.quantized import quantize
-from jaxprt.systems.separable.wavelets import project
+from jaxprt.systems.separable.sparse import project
+from jaxprt.visibility import members
 from jaxprt.visibility import precompute as see
 
 SIZE = 8
@@ -59,7 +59,7 @@ def relight(mesh, brdf, light, *, keep=24, eye=EYE, vertex=None):
     """Radiance, checked to be finite."""
     count, vertex = repeated(mesh, vertex)
     transport = precompute(mesh, brdf, keep=keep, size=SIZE, vertex=vertex, progress=False)
-    color = np.asarray(separable.radiance(transport, brdf, light, eye=eye))
+    color = np.asarray(prt.radiance(separable.SeparableSystem(transport, brdf), light, eye=eye))
     assert color.shape == (len(vertex), 3)
     assert np.isfinite(color).all()
     return color[:count]
@@ -169,25 +169,6 @@ def test_what_touches_the_ground_is_not_lit_from_beneath(lambert):
     assert not relight(mesh, lambert, below, vertex=near).any()
 
 
-def test_one_huge_coefficient_erases_no_others_when_quantized(glossy, light, close):
-    mesh = sphere()
-    transport = precompute(mesh, glossy, keep=24, size=SIZE, progress=False)
-    spoiled = eqx.tree_at(lambda t: t.value, transport, transport.value.at[0, 5, 1].multiply(1e6))
-    color, expected = (separable.radiance(quantize(each), glossy, light, eye=EYE) for each in (spoiled, transport))
-    assert np.isfinite(np.asarray(color)).all()
-    others = np.arange(len(mesh.position)) != 5
-    np.testing.assert_array_equal(color[others], expected[others])
-    # 32,767 levels for each vertex and term.
-    close(expected, separable.radiance(transport, glossy, light, eye=EYE), tolerance=1e-4)
-    close(color[5], separable.radiance(spoiled, glossy, light, eye=EYE)[5], tolerance=1e-4)
-
-
-def test_transport_of_zeros_is_quantized_to_zeros(lambert, light):
-    transport = precompute(sphere(), lambert, keep=24, size=SIZE, progress=False)
-    dark = eqx.tree_at(lambda t: t.value, transport, 0 * transport.value)
-    assert not np.asarray(separable.radiance(quantize(dark), lambert, light, eye=EYE)).any()
-
-
 @pytest.fixture(scope="module")
 def seen():
     """Visibility from the 38 vertices of a sphere that lies on a ground."""
@@ -204,7 +185,7 @@ def clustered_radiance(seen, brdf, light, **options):
     transport = separable.clustered.precompute(seen, brdf, progress=False, **KEPT | options)
     for name in ("mode", "core", "weight", "rms"):
         assert np.isfinite(np.asarray(getattr(transport, name), np.float64)).all(), name
-    color = np.asarray(separable.radiance(transport, brdf, light, eye=EYE))
+    color = np.asarray(prt.radiance(separable.SeparableSystem(transport, brdf), light, eye=EYE))
     assert np.isfinite(color).all()
     return color
 
@@ -214,7 +195,7 @@ def all_texels(seen, brdf, light):
     level = jnp.asarray(seen.seen(np.arange(len(seen.position))))
     if not isinstance(brdf, SeparableBrdf):
         return np.asarray(reference.integrate(level, seen.position, seen.frame, brdf, light, EYE, error=1e-5))
-    met = np.einsum("vdrl,dc->vrc", project(level, seen.frame, brdf), separable.project(light))
+    met = np.einsum("vdrl,dc->vrc", project(level, seen.frame, brdf), separable.system.project(light))
     return np.sum(met * np.asarray(brdf.view(directions.view(seen.frame, seen.position, EYE))), 1)
 
 
@@ -260,7 +241,7 @@ def test_clusters_of_one_vertex_are_that_vertex(seen, glossy, light, close):
 @pytest.mark.parametrize("which", ["one vertex", "a cluster", "all"])
 def test_vertices_that_see_nothing_are_black_and_the_others_as_they_were(seen, light, close, which):
     brdf = factor(AshikhminShirley(diffuse=[0.3, 0.2, 0.1], specular=0.5), terms=3, resolution=12)
-    member = separable.members.cluster(seen.position, seen.frame[:, 2], clusters=4)
+    member = members.cluster(seen.position, seen.frame[:, 2], clusters=4)
     vertex = {"one vertex": member[1, :1], "a cluster": member[1], "all": np.arange(len(seen.position))}[which]
     color = clustered_radiance(blind(seen, vertex), brdf, light)
     expected = all_texels(seen, brdf, light).copy()

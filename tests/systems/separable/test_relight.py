@@ -11,11 +11,9 @@ from jaxprt import separable
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.scene import Environment
 from jaxprt.scene.environment import rotate
-from jaxprt.sphere import haar
-from jaxprt.systems.separable import SeparableBrdf, SparseTransport, factor, join, precompute
+from jaxprt.systems.separable import SparseTransport, factor, precompute
 from jaxprt.systems.separable.factorization import marked
-from jaxprt.systems.separable.quantized import dequantize, quantize
-from jaxprt.systems.separable.wavelets import compress
+from jaxprt.systems.separable.sparse import compress
 
 SIZE = 8
 EYE = jnp.array([2.0, 3.0, 4.0])
@@ -74,7 +72,7 @@ def grounded(*, shift=(0.0, 0.0, 0.0)):
 
 
 def relight(transport, factored, light, **options):
-    return separable.radiance(transport, factored, light, **({"eye": EYE} | options))
+    return prt.radiance(separable.SeparableSystem(transport, factored), light, **({"eye": EYE} | options))
 
 
 def test_gray_light_serves_a_brdf_in_color(transport, factored, close, random):
@@ -93,9 +91,10 @@ def test_the_distance_of_the_eye_does_not_matter(transport, factored, close, ran
 
 def test_light_tuple_times_view_tuple_is_radiance(transport, factored, close, random):
     light = some_light(random)
-    lit, view = separable.light_tuple(transport, light), separable.view_tuple(transport, factored, EYE)
+    system = separable.SeparableSystem(transport, factored)
+    lit, view = system.light(light), system.view(EYE)
     assert lit.shape == view.shape == (7, 3, 3)
-    close(separable.combine(lit, view), relight(transport, factored, light))
+    close(system.combine(lit, view), relight(transport, factored, light))
     close(np.sum(np.asarray(lit) * np.asarray(view), 1), relight(transport, factored, light))
 
 
@@ -104,111 +103,17 @@ def test_view_tuples_are_the_view_maps_at_the_direction_to_the_eye(transport, fa
     local = np.einsum("vij,vj->vi", transport.frame, offset / np.linalg.norm(offset, axis=1, keepdims=True))
     above = local[:, 2] > 0.01
     expected = np.asarray(factored.view(array(local)))
-    close(np.asarray(separable.view_tuple(transport, factored, EYE))[above], expected[above])
+    close(np.asarray(separable.SeparableSystem(transport, factored).view(EYE))[above], expected[above])
 
 
 def test_projection_keeps_energy_and_transforms_each_face_by_itself(random, close):
     light = some_light(random)
-    coefficient = np.asarray(separable.project(light))
+    coefficient = np.asarray(separable.system.project(light))
     close(np.sum(coefficient**2), np.sum(np.asarray(light.radiance) ** 2))
     only = np.asarray(light.radiance) * (np.arange(6) == 3)[:, None, None, None]
-    face = np.asarray(separable.project(Environment(array(only)))).reshape(6, -1, 3)
+    face = np.asarray(separable.system.project(Environment(array(only)))).reshape(6, -1, 3)
     close(face[3], coefficient.reshape(6, -1, 3)[3])
     assert not np.delete(face, 3, axis=0).any()
-
-
-def test_dropped_coefficients_of_the_light_have_no_part_in_the_gradient(transport, factored, random):
-    light = some_light(random)
-    gradient = jax.grad(lambda e: jnp.sum(relight(transport, factored, e, light_keep=9)))(light)
-    coefficient = np.asarray(separable.project(gradient))
-    assert np.count_nonzero(np.abs(coefficient).max(1) > 1e-4 * np.abs(coefficient).max()) <= 9
-
-
-def coefficients(random):
-    value = random.normal(size=(6 * SIZE**2, 3)) * random.uniform(size=(6 * SIZE**2, 1)) ** 4
-    return array(value)
-
-
-def kept(coefficient, chosen):
-    """Rows that were kept, after a check that they are unchanged and all others are zero."""
-    chosen = np.asarray(chosen)
-    assert not chosen[chosen != np.asarray(coefficient)].any()
-    return np.flatnonzero(chosen.any(1))
-
-
-@pytest.mark.parametrize("count", [1, 17, 384])
-def test_choosing_by_transport_keeps_the_largest_products_with_its_rms(random, count):
-    coefficient, rms = coefficients(random), array(random.uniform(0.1, 1, size=384))
-    chosen = separable.choose_by_transport(coefficient, rms, count=count)
-    order = np.argsort(-np.linalg.norm(np.asarray(coefficient, np.float64), axis=1) * np.asarray(rms, np.float64))
-    np.testing.assert_array_equal(kept(coefficient, chosen), np.sort(order[:count]))
-
-
-@pytest.mark.parametrize("count", [1, 17, 384])
-def test_choosing_by_area_keeps_the_largest_products_with_it(random, count):
-    coefficient = coefficients(random)
-    chosen = separable.choose_by_area(coefficient, count=count)
-    # What a basis function covers, from the function itself.
-    impulse = haar.inverse(array(np.eye(SIZE**2).reshape(SIZE**2, SIZE, SIZE, 1)))
-    area = np.tile(np.mean(np.abs(np.asarray(impulse)) > 1e-6, axis=(1, 2, 3)), 6)
-    weight = np.linalg.norm(np.asarray(coefficient, np.float64), axis=1) * area
-    np.testing.assert_array_equal(kept(coefficient, chosen), np.sort(np.argsort(-weight)[:count]))
-
-
-def test_choosing_by_magnitude_drops_each_color_below_the_threshold(random):
-    coefficient = array(np.asarray(coefficients(random)) * [1.0, 10.0, 0.0])
-    chosen = np.asarray(separable.choose_by_magnitude(coefficient, threshold=1024))
-    size = np.abs(np.asarray(coefficient, np.float64))
-    level = np.round(size / size.max(0).clip(1e-30) * 32767)
-    np.testing.assert_array_equal(chosen, np.where(level >= 1024, coefficient, 0))
-    assert 1 < np.count_nonzero(chosen[:, 0]) < 384
-    np.testing.assert_array_equal(separable.choose_by_magnitude(coefficient, threshold=0), coefficient)
-    # A threshold is relative: it does not know the light's units.
-    larger = array(np.asarray(coefficient) * 1024)
-    np.testing.assert_array_equal(separable.choose_by_magnitude(larger, threshold=1024), chosen * 1024)
-
-
-def test_quantizing_rounds_each_color_to_multiples_of_its_largest(random, close):
-    coefficient = array(np.asarray(coefficients(random)) * [1.0, 1e6, 0.0])
-    wide = np.asarray(coefficient, np.float64)
-    quantum = np.abs(wide).max(0) / 32767
-    rounded = np.asarray(separable.quantize(coefficient), np.float64)
-    level = rounded[:, :2] / quantum[:2]
-    np.testing.assert_allclose(level, np.round(level), atol=0.004)
-    assert np.all(np.abs(rounded - wide)[:, :2].max(0) > 0.4 * quantum[:2])
-    assert np.all(np.abs(rounded - wide) <= 0.504 * quantum)
-    assert not rounded[:, 2].any()
-    close(separable.quantize(rounded.astype(np.float32)), rounded)
-    # Twice the light is twice the levels' worth: a quantum is relative.
-    larger = array(np.asarray(coefficient) * 1024)
-    np.testing.assert_array_equal(separable.quantize(larger), np.asarray(separable.quantize(coefficient)) * 1024)
-
-
-def test_choosing_as_many_as_there_are_drops_none(transport, factored, close, random):
-    light = some_light(random)
-    expected = relight(transport, factored, light)
-    np.testing.assert_array_equal(relight(transport, factored, light, light_keep=384), expected)
-    # Nor does it matter to drop what no vertex keeps.
-    used = int(np.count_nonzero(np.asarray(transport.rms)))
-    close(relight(transport, factored, light, light_keep=used), expected)
-
-
-def test_the_error_falls_with_the_number_of_coefficients_of_the_light(transport, factored, random):
-    light = some_light(random)
-    whole, *fewer = (np.asarray(relight(transport, factored, light, light_keep=k)) for k in (384, 6, 30, 100, 200))
-    error = [np.linalg.norm(color - whole) for color in fewer]
-    assert error[0] > error[1] > error[2] > error[3]
-
-
-@pytest.mark.parametrize("count", [0, 385, -1])
-def test_impossible_numbers_to_choose_are_refused(transport, random, count):
-    coefficient = coefficients(random)
-    with pytest.raises(ValueError, match=f"count must be between 1 and 384, got {count}"):
-        separable.choose_by_transport(coefficient, array(np.ones(384)), count=count)
-    with pytest.raises(ValueError, match=f"count must be between 1 and 384, got {count}"):
-        separable.choose_by_area(coefficient, count=count)
-    with pytest.raises(ValueError, match=f"count must be between 1 and 384, got {count}"):
-        separable.light_tuple(transport, some_light(random), light_keep=count)
 
 
 def test_lights_of_another_size_are_refused(transport, factored):
@@ -222,112 +127,7 @@ def test_lights_of_another_size_are_refused(transport, factored):
 def test_only_one_light_of_six_square_faces_is_taken(transport, factored, shape):
     needed = r"(must be one environment \[6, (8, 8|n, n), c\]|'s radiance must be \[\.\.\., 6, n, n, c\]), got"
     with pytest.raises(ValueError, match="the light ?" + needed):
-        relight(transport, factored, white_light(*shape))
-
-
-def test_transport_in_whole_numbers_relights_like_transport_in_floating_point(transport, factored, close, random):
-    light, whole = some_light(random), quantize(transport)
-    # Rounding to 32,767 levels of the largest coefficient of each row.
-    close(relight(whole, factored, light), relight(transport, factored, light), tolerance=1e-4)
-    close(
-        relight(whole, factored, light, light_keep=30),
-        relight(transport, factored, light, light_keep=30),
-        tolerance=1e-4,
-    )
-    with pytest.raises(ValueError, match="the BRDF must have the transport's 3 terms, got 2"):
-        relight(whole, factored.truncate(2), light)
-
-
-@pytest.fixture(scope="module")
-def basis():
-    """Three BRDFs on maps of one kind, of 1, 3 and 2 terms."""
-    sharp = AshikhminShirley(diffuse=0.0, specular=0.4, nu=30, nv=30)
-    models = ((Lambert(1.0), 1), (COLORED, 3), (sharp, 2))
-    return [factor(model, terms=terms, resolution=12) for model, terms in models]
-
-
-TERMS = (1, 3, 2)
-
-
-def test_joined_brdfs_are_the_sum_of_their_parts(basis, random, close):
-    wi, wo = unit(random), unit(random)
-    joined = join(basis)
-    assert joined.terms == sum(TERMS)
-    assert joined.coordinates is basis[0].coordinates
-    close(joined(wi, wo), sum(np.asarray(each(wi, wo)) for each in basis))
-    close(join(basis[1:2])(wi, wo), basis[1](wi, wo))
-
-
-def test_two_lamberts_joined_are_the_lambert_of_their_summed_albedos(random, close):
-    wi, wo = unit(random), unit(random)
-    parts = [factor(Lambert(albedo), terms=1, resolution=12) for albedo in ([0.1, 0.2, 0.3], [0.25] * 3)]
-    expected = np.array([0.35, 0.45, 0.55]) / np.pi * ((np.asarray(wi)[:, 2:] > 0) & (np.asarray(wo)[:, 2:] > 0))
-    close(join(parts)(wi, wo), expected, tolerance=1e-4)  # One term of a factorization in float32.
-
-
-def test_brdfs_on_other_maps_are_not_joined(basis):
-    maps, error = (basis[1].light_map, basis[1].view_map), array(0.0)
-    smaller = (array(np.asarray(each)[:, :10, :10]) for each in maps)
-    for other in (SeparableBrdf(*smaller, error), SeparableBrdf(*maps, error)):
-        with pytest.raises(
-            ValueError, match="brdfs must be at least one, all with maps of the same resolution and coordinates, got"
-        ):
-            join([basis[0], other])
-    with pytest.raises(ValueError, match="got none"):
-        join([])
-
-
-@pytest.fixture(scope="module")
-def spotted(basis):
-    """A mesh that shadows itself, its vertices' own weights of the basis, and their radiance by each BRDF alone."""
-    mesh = grounded()
-    random = np.random.default_rng(8)
-    weight = array(random.uniform(0, 1, size=(len(mesh.position), 3, 3)))
-    light = some_light(random)
-    alone = [precompute(mesh, each, keep=6 * SIZE**2, size=SIZE, progress=False) for each in basis]
-    part = [np.asarray(relight(own, each, light), np.float64) for own, each in zip(alone, basis, strict=True)]
-    return mesh, weight, light, sum(np.asarray(weight)[:, n] * each for n, each in enumerate(part))
-
-
-def modulated(transport, brdf, light, weight, terms=TERMS):
-    view = separable.modulate(separable.view_tuple(transport, brdf, EYE), weight, terms=terms)
-    return separable.combine(separable.light_tuple(transport, light), view)
-
-
-def test_weights_per_vertex_give_every_vertex_its_own_brdf(basis, spotted, close):
-    mesh, weight, light, expected = spotted
-    joined = join(basis)
-    transport = precompute(mesh, joined, keep=6 * SIZE**2, size=SIZE, progress=False)
-    assert np.count_nonzero(expected.any(1)) > 9
-    close(modulated(transport, joined, light, weight), expected, tolerance=RIM)
-    # Equal weights are a BRDF for all; a single one is that BRDF alone.
-    ones = array(np.ones(weight.shape))
-    close(modulated(transport, joined, light, ones), relight(transport, joined, light))
-    one = precompute(mesh, basis[1], keep=6 * SIZE**2, size=SIZE, progress=False)
-    alone = array(np.asarray(ones) * (np.arange(3) == 1)[:, None])
-    close(modulated(transport, joined, light, alone), relight(one, basis[1], light))
-    # Linear, hence the derivative along any change is the radiance of that change.
-    change = array(np.random.default_rng(3).normal(size=weight.shape))
-    _, slope = jax.jvp(lambda w: modulated(transport, joined, light, w), (weight,), (change,))
-    close(slope, modulated(transport, joined, light, change))
-
-
-def test_a_texture_on_one_brdf_multiplies_the_radiance(transport, factored, close, random):
-    light, texture = some_light(random), random.uniform(size=(7, 1, 3)).astype(np.float32)
-    plain = np.asarray(relight(transport, factored, light))
-    close(modulated(transport, factored, light, array(texture), (3,)), plain * texture[:, 0])
-    # A gray texture, and gray view maps under a texture in color.
-    gray = texture[..., :1]
-    close(modulated(transport, factored, light, array(gray), (3,)), plain * gray[:, 0])
-    single = eqx.tree_at(lambda b: b.view_map, factored, array(np.asarray(factored.view_map)[..., :1]))
-    plain = np.asarray(relight(transport, single, light))
-    close(modulated(transport, single, light, array(texture), (3,)), plain * texture[:, 0])
-
-
-@pytest.mark.parametrize("terms", [(3,), (1, 1), (2, 2), (1, 1, 1)])
-def test_weights_that_do_not_fit_the_terms_are_refused(terms):
-    with pytest.raises(ValueError, match="terms must hold one number for each of 2 weights and sum to the 3 terms"):
-        separable.modulate(array(np.ones((7, 3, 3))), array(np.ones((7, 2, 1))), terms=terms)
+        separable.SeparableSystem(transport, factored).light(white_light(*shape))
 
 
 def test_brdfs_with_another_number_of_terms_are_refused(transport, factored):
@@ -370,16 +170,14 @@ def test_transport_refuses_factors_that_it_was_not_made_of_wherever_values_are_k
         eqx.tree_at(lambda b: b.light_map, factored, array(each))
         for each in (np.nextafter(maps, np.float32(np.inf)), maps * np.array([1, -1, 1])[:, None, None, None])
     )
-    wrong = [turned, factor(Lambert(0.5), terms=3, resolution=12), join([factored.truncate(1), factored.truncate(2)])]
-    for each in (known, dequantize(quantize(known)), quantize(known), known.with_transpose(), known.truncate(40)):
+    wrong = [turned, factor(Lambert(0.5), terms=3, resolution=12)]
+    for each in (known, known.with_transpose(), known.truncate(40)):
         assert each.mark is not None
         for right in (factored, rounded):
             np.testing.assert_allclose(relight(each, right, light), expected, rtol=0.1, atol=0.1)
         for other in wrong:
             with pytest.raises(ValueError, match=r"the BRDF must be the one that .* differ from the transport's by \d"):
                 relight(each, other, light)
-            with pytest.raises(ValueError, match="the BRDF must be the one that"):
-                separable.view_tuple(each, other, EYE)
     np.testing.assert_array_equal(
         relight(known.truncate(40, terms=2), factored.truncate(2), light).shape, expected.shape
     )

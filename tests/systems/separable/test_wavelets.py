@@ -8,12 +8,13 @@ import pytest
 import scipy.ndimage
 
 import jaxprt as prt
+from benchmarks.published.factorization import factor_symmetric
 from jaxprt import separable
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.scene import Environment
 from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.systems.separable import SparseTransport, precompute
-from jaxprt.systems.separable.wavelets import compress, project
+from jaxprt.systems.separable.sparse import compress, project
 
 # The texels that the horizon cuts count with what of them is above in sum, not each ray: measured 7.7e-5 at worst.
 HORIZON = 2e-4
@@ -74,7 +75,7 @@ def transport_of(seen, frame, brdf, *, keep, position=None):
 def test_products_with_light_equal_a_direct_sum_in_float64(random, factored, close, size):
     seen, frame = visible(random, 5, size), frames(random, 5)
     light = random.uniform(0, 3, size=(6, size, size, 3)).astype(np.float32)
-    coefficient = prt.separable.project(Environment(jnp.asarray(light)))
+    coefficient = separable.system.project(Environment(jnp.asarray(light)))
     product = jnp.einsum("bdr,dc->brc", project(seen, frame, factored)[..., 0], coefficient)
     close(product, direct_sum(seen, frame, factored, light.reshape(-1, 3), size))
 
@@ -98,7 +99,7 @@ def test_unoccluded_lambert_under_constant_light_reflects_its_albedo(random):
     frame = frames(random, 30)
     brdf = separable.factor(Lambert(albedo), terms=1, resolution=12)
     seen = jnp.full((30, 6 * size * size), 16, jnp.uint8)
-    light = prt.separable.project(Environment(jnp.ones((6, size, size, 3))))
+    light = separable.system.project(Environment(jnp.ones((6, size, size, 3))))
     view = brdf.view(directions.normalize(jnp.asarray(np.abs(random.normal(size=(30, 3))), jnp.float32)))
     reflected = jnp.einsum("bdr,dc->brc", project(seen, frame, brdf)[..., 0], light)
     np.testing.assert_allclose(jnp.sum(reflected * view, 1), np.tile(albedo, (30, 1)), rtol=HORIZON, atol=1e-12)
@@ -107,13 +108,13 @@ def test_unoccluded_lambert_under_constant_light_reflects_its_albedo(random):
 def test_six_means_carry_all_of_constant_light():
     mean = np.zeros((6, 8, 8), bool)
     mean[:, 0, 0] = True
-    light = prt.separable.project(Environment(jnp.ones((6, 8, 8, 3))))
+    light = separable.system.project(Environment(jnp.ones((6, 8, 8, 3))))
     np.testing.assert_array_equal(np.abs(light[:, 0]) > 1e-6, mean.ravel())
 
 
 @pytest.mark.parametrize("per_color", [False, True], ids=["joint colors", "published, per color"])
 def test_all_coefficients_and_the_view_maps_make_the_radiance_of_a_sum_in_float64(random, factored, close, per_color):
-    brdf = separable.published.factor_symmetric(COLORED, terms=3, resolution=12) if per_color else factored
+    brdf = factor_symmetric(COLORED, terms=3, resolution=12) if per_color else factored
     seen, frame = visible(random, 6, 8), frames(random, 6)
     position = jnp.asarray(random.normal(size=(6, 3)), jnp.float32)
     transport = transport_of(seen, frame, brdf, keep=384, position=position)
@@ -123,7 +124,7 @@ def test_all_coefficients_and_the_view_maps_make_the_radiance_of_a_sum_in_float6
     wo = directions.view(frame, position, eye)
     met = direct_sum(seen, frame, brdf, light.radiance.reshape(-1, 3), 8)
     expected = np.sum(met * np.asarray(brdf.view(wo), np.float64), 1)
-    close(prt.separable.radiance(transport, brdf, light, eye=eye), expected, tolerance=EXACT)
+    close(prt.radiance(prt.separable.SeparableSystem(transport, brdf), light, eye=eye), expected, tolerance=EXACT)
     assert np.count_nonzero(np.asarray(expected)) > 3
 
 

@@ -1,12 +1,16 @@
 """Quantized transport against plain rounding in NumPy, bit fields packed by hand, and transport in floating point."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.systems.separable import QuantizedTransport, SparseTransport
-from jaxprt.systems.separable.quantized import dequantize, quantize
+import jaxprt as prt
+from benchmarks.published.quantized import dequantize, quantize
+from jaxprt.brdf import AshikhminShirley
+from jaxprt.scene import builtin
+from jaxprt.systems.separable import SeparableSystem, SparseTransport, factor, precompute
 
 COLORS = pytest.mark.parametrize("colors", [1, 3])
 LAST = {1: np.array([32767]), 3: np.array([1023, 1023, 511])}
@@ -158,7 +162,6 @@ def test_kept_prefixes_are_prefixes_of_the_same_levels(random, colors, close):
 def test_vertices_keep_their_places_and_the_light_its_gradient(random, close):
     transport = make(some(random, 3))
     quantized = quantize(transport)
-    assert isinstance(quantized, QuantizedTransport)
     for field in ("position", "frame", "rms"):
         np.testing.assert_array_equal(getattr(quantized, field), getattr(transport, field))
     light, weight = (jnp.asarray(random.normal(size=shape), jnp.float32) for shape in ((SIZE, 3), (VERTICES, TERMS, 3)))
@@ -174,3 +177,56 @@ def test_vertices_keep_their_places_and_the_light_its_gradient(random, close):
 def test_other_numbers_of_colors_are_refused(random):
     with pytest.raises(ValueError, match="the transport must have 1 or 3 colors, got 2"):
         quantize(make(some(random, 3)[..., :2]))
+
+
+@pytest.fixture(scope="module")
+def glossy():
+    return factor(AshikhminShirley(diffuse=0.3, specular=0.5, nu=20, nv=80), terms=4, resolution=12)
+
+
+@pytest.fixture(scope="module")
+def traced(glossy):
+    return precompute(builtin.sphere(rings=5, sectors=8), glossy, keep=24, size=8, progress=False)
+
+
+def relight(transport, brdf):
+    light = builtin.daylight(size=8)
+    return np.asarray(prt.radiance(SeparableSystem(transport, brdf), light, eye=jnp.array([1.0, 2.0, 3.0])))
+
+
+def test_one_huge_coefficient_erases_no_others(traced, glossy, close):
+    spoiled = eqx.tree_at(lambda t: t.value, traced, traced.value.at[0, 5, 1].multiply(1e6))
+    color, expected = (relight(quantize(transport), glossy) for transport in (spoiled, traced))
+    assert np.isfinite(color).all()
+    others = np.arange(len(color)) != 5
+    np.testing.assert_array_equal(color[others], expected[others])
+    # 32,767 levels for each vertex and term.
+    close(expected, relight(traced, glossy), tolerance=1e-4)
+    close(color[5], relight(spoiled, glossy)[5], tolerance=1e-4)
+
+
+def test_transport_of_zeros_is_quantized_to_zeros(traced, glossy):
+    dark = eqx.tree_at(lambda t: t.value, traced, 0 * traced.value)
+    assert not relight(quantize(dark), glossy).any()
+
+
+def test_factors_that_the_transport_was_not_made_of_are_refused(traced, glossy):
+    quantized = quantize(traced)
+    other = factor(AshikhminShirley(), terms=4, resolution=12)
+    for transport in (quantized, dequantize(quantized), quantized.truncate(20)):
+        with pytest.raises(ValueError, match="the BRDF must be the one that"):
+            SeparableSystem(transport, other)
+    with pytest.raises(ValueError, match="the BRDF must have the transport's 4 terms, got 2"):
+        SeparableSystem(quantized, glossy.truncate(2))
+
+
+@pytest.mark.parametrize("terms", [-1, 0, 4])
+def test_keeping_an_impossible_number_of_terms_is_refused(random, terms):
+    with pytest.raises(ValueError, match=f"terms must be between 1 and 3, got {terms}"):
+        quantize(make(some(random, 3))).truncate(6, terms=terms)
+
+
+def test_lights_of_another_number_of_coefficients_are_refused(random):
+    for count in (6, 96):
+        with pytest.raises(ValueError, match=f"the light's coefficients must be 24, got {count}"):
+            quantize(make(some(random, 3))).apply(jnp.ones((count, 3)))

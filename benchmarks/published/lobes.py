@@ -1,21 +1,23 @@
-"""Published lobes: fixed widths around the mirror direction."""
+"""Published lobes: fixed widths around the mirror direction; and the rest of a BRDF, for low-rank terms."""
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxprt.compile import jit
 from jaxprt.decompose import mixture
 from jaxprt.systems.lobe import em
 from jaxprt.systems.lobe import table as lobe_table
+from jaxprt.systems.lobe.table import LobeBrdf
+
+_GRAZING = 1e-3
 
 
-def mirror_lobes(
-    brdf: Callable, *, angles: tuple[int | float, ...] = (0, 7, 14, 21), resolution: int = 32
-) -> lobe_table.LobeBrdf:
+def mirror_lobes(brdf: Callable, *, angles: tuple[int | float, ...] = (0, 7, 14, 21), resolution: int = 32) -> LobeBrdf:
     """Fits lobes of fixed widths around the mirror direction to BRDF x cosine.
 
     A lobe of k degrees is a Gaussian with three standard deviations in k degrees. 0 degrees is the perfect mirror,
@@ -30,7 +32,7 @@ def mirror_lobes(
         resolution: Number of view angle nodes. Anisotropic BRDFs have maps with half this edge.
 
     Returns:
-        A table of lobes without a diffuse part. `lobe.Remainder` is the rest of the BRDF, which may be negative.
+        A table of lobes without a diffuse part. `Remainder` is the rest of the BRDF, which may be negative.
 
     Raises:
         ValueError: There are no angles, an angle is negative, or the BRDF returns values that are negative or not
@@ -44,7 +46,7 @@ def mirror_lobes(
     width = np.radians(np.asarray(angles, np.float64)) / 3
     concentration = (1 / np.maximum(width**2, 1 / em.FINEST)).astype(wo.dtype)
     mean, scale, weight, diffuse = _mirror_lobes(wo, sample, mass, extent, concentration)
-    return lobe_table.LobeBrdf(mean, scale, weight, diffuse, (), jax.device_put(np.asarray(np.nan, wo.dtype)))
+    return LobeBrdf(mean, scale, weight, diffuse, (), jax.device_put(np.asarray(np.nan, wo.dtype)))
 
 
 @jit
@@ -70,3 +72,19 @@ def _mirror_lobes(
     scale = jnp.broadcast_to(jnp.log(concentration)[:, None], (count, len(mean))).reshape(-1, *nodes)
     weight = weight.reshape(*weight.shape[:2], *nodes)
     return table, scale, weight, 0 * weight[:, 0]
+
+
+class Remainder(eqx.Module):
+    """The difference of a BRDF and its lobes, for low-rank terms. It is a BRDF whose values may be negative.
+
+    Attributes:
+        brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions.
+        lobe: Table of its lobes, including the diffuse part.
+    """
+
+    brdf: Callable
+    lobe: LobeBrdf
+
+    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+        """Value in 1/sr: the BRDF minus the lobes divided by the cosine of wi, which is clamped to at least 0.001."""
+        return self.brdf(wi, wo) - self.lobe(wi, wo) / jnp.maximum(wi[..., 2:], _GRAZING)

@@ -5,11 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt import separable
+from benchmarks.published.factorization import (
+    brown_plastic,
+    factor_normalized,
+    factor_symmetric,
+    red_plastic,
+    sample_error,
+)
 from jaxprt.brdf import AshikhminShirley, Lafortune, Lambert
 from jaxprt.decompose import eigen
 from jaxprt.sphere import hemisphere
-from jaxprt.systems.separable import sample_error
 
 WANG = AshikhminShirley(diffuse=0.5, specular=0.75, nu=10, nv=100)
 MAPS = {
@@ -48,7 +53,7 @@ def evaluate(brdf, wi, wo):
 def test_all_terms_reproduce_every_texel(name):
     direction, _ = _texels(name, 8)
     wi, wo = _pairs(direction)
-    factored = separable.published.factor_symmetric(WANG, terms=len(direction), resolution=8, coordinates=MAPS[name][0])
+    factored = factor_symmetric(WANG, terms=len(direction), resolution=8, coordinates=MAPS[name][0])
     expected = np.asarray(evaluate(WANG, wi, wo))
     # The last eigenvalues lie below single precision of the first, and with them their share of the norm.
     assert np.linalg.norm(evaluate(factored, wi, wo) - expected) < 1e-2 * np.linalg.norm(expected)
@@ -59,7 +64,7 @@ def test_all_terms_reproduce_every_texel(name):
 def test_error_is_the_optimum_of_its_rank(name):
     matrix = _weighted(name, 16, WANG)
     value = np.sort(np.linalg.eigvalsh(matrix) ** 2)[::-1]
-    factored = separable.published.factor_symmetric(WANG, terms=8, resolution=16, coordinates=MAPS[name][0])
+    factored = factor_symmetric(WANG, terms=8, resolution=16, coordinates=MAPS[name][0])
     assert factored.error == pytest.approx(np.sqrt(np.sum(value[8:]) / np.sum(value)), rel=1e-4)
     direction, area = _texels(name, 16)
     found = np.asarray(evaluate(factored, *_pairs(direction)), np.float64).reshape(matrix.shape) * np.sqrt(
@@ -69,7 +74,7 @@ def test_error_is_the_optimum_of_its_rank(name):
 
 
 def test_published_spectrum_of_the_published_brdf():
-    factored = separable.published.factor_symmetric(WANG, terms=16)
+    factored = factor_symmetric(WANG, terms=16)
     # |light map inside the disk|^2 is the eigenvalue's magnitude.
     area = hemisphere.texel_area(resolution=48)
     light, view = (np.asarray(each)[..., 0] for each in (factored.light_map, factored.view_map))
@@ -83,8 +88,7 @@ def test_published_spectrum_of_the_published_brdf():
 
 def test_the_printed_iteration_gives_a_worse_but_finite_factorization_and_states_its_error():
     best, printed = (
-        separable.published.factor_symmetric(WANG, terms=8, resolution=16, solve=solve)
-        for solve in (eigen.symmetric, eigen.power)
+        factor_symmetric(WANG, terms=8, resolution=16, solve=solve) for solve in (eigen.symmetric, eigen.power)
     )
     assert best.error < printed.error < 1
     assert jnp.max(jnp.abs(printed.light_map)) < 2 * jnp.max(jnp.abs(best.light_map))
@@ -105,11 +109,11 @@ def test_lafortune_and_plastics_are_reciprocal_and_factored_per_color():
         cz=np.array([[-1.354682, -2.714801, -1.569866], [0.676108, 0.679314, 0.726031]]),
         exponent=np.array([[17.968505, 11.024489, 21.270282], [8.219745, 9.055139, 11.261951]]),
     )
-    for brdf in (clay, separable.published.red_plastic(), separable.published.brown_plastic()):
-        factored = separable.published.factor_symmetric(brdf, terms=8, resolution=16)
+    for brdf in (clay, red_plastic(), brown_plastic()):
+        factored = factor_symmetric(brdf, terms=8, resolution=16)
         assert factored.light_map.shape == (8, 16, 16, 3)
         assert jnp.all(jnp.isfinite(factored.light_map))
-        one = separable.published.factor_symmetric(brdf, terms=1, resolution=16)
+        one = factor_symmetric(brdf, terms=1, resolution=16)
         assert factored.error < one.error < 1
 
 
@@ -122,7 +126,7 @@ def test_normalized_term_of_a_product_is_exact(name):
     def product(wi, wo):
         return (0.2 + wi[..., 2:] ** 2) * (0.1 + wo[..., :1] ** 2) * color
 
-    factored = separable.published.factor_normalized(product, resolution=8, coordinates=MAPS[name][0])
+    factored = factor_normalized(product, resolution=8, coordinates=MAPS[name][0])
     assert factored.light_map.shape == (1, 8, 8, 1)
     assert factored.view_map.shape == (1, 8, 8, 3)
     assert factored.error < 1e-5
@@ -134,7 +138,7 @@ def test_normalized_term_has_the_reflectance_of_every_view(name):
     brdf = AshikhminShirley(diffuse=[0.9, 0.2, 0.1], specular=0.3)
     direction, area = _texels(name, 16)
     wi, wo = _pairs(direction)
-    factored = separable.published.factor_normalized(brdf, resolution=16, coordinates=MAPS[name][0])
+    factored = factor_normalized(brdf, resolution=16, coordinates=MAPS[name][0])
     count = len(direction)
     expected, found = (
         np.einsum("oic,i->oc", np.asarray(evaluate(f, wi, wo)).reshape(count, count, -1), area)
@@ -144,15 +148,15 @@ def test_normalized_term_has_the_reflectance_of_every_view(name):
 
 
 def test_normalized_term_is_near_the_best_single_term():
-    single = separable.published.factor_symmetric(WANG, terms=1, resolution=16)
-    factored = separable.published.factor_normalized(WANG, resolution=16)
+    single = factor_symmetric(WANG, terms=1, resolution=16)
+    factored = factor_normalized(WANG, resolution=16)
     assert single.error < factored.error < 1.05 * single.error
 
 
 def test_black_brdf_gives_zero_without_nan():
     for factored in (
-        separable.published.factor_symmetric(Lambert(0.0), terms=2, resolution=8),
-        separable.published.factor_normalized(Lambert(0.0), resolution=8),
+        factor_symmetric(Lambert(0.0), terms=2, resolution=8),
+        factor_normalized(Lambert(0.0), resolution=8),
     ):
         assert factored.error == 0
         assert jnp.all(factored.light_map == 0)
@@ -161,7 +165,7 @@ def test_black_brdf_gives_zero_without_nan():
 
 def test_polar_maps_are_read_across_the_seam_and_after_pickling():
     coordinates = hemisphere.polar_coordinates
-    factored = separable.published.factor_symmetric(WANG, terms=8, resolution=16, coordinates=coordinates)
+    factored = factor_symmetric(WANG, terms=8, resolution=16, coordinates=coordinates)
     again = pickle.loads(pickle.dumps(factored))
     assert again.coordinates is coordinates
     # The seam is where x = 0 and y > 0.
@@ -175,8 +179,8 @@ def test_polar_maps_are_read_across_the_seam_and_after_pickling():
 @pytest.mark.parametrize(
     "factor",
     [
-        separable.published.factor_normalized,
-        lambda brdf, **options: separable.published.factor_symmetric(brdf, terms=1, **options),
+        factor_normalized,
+        lambda brdf, **options: factor_symmetric(brdf, terms=1, **options),
     ],
 )
 def test_bad_options_are_refused(factor):
@@ -190,13 +194,37 @@ def test_bad_options_are_refused(factor):
 
 def test_more_terms_than_texels_and_other_than_reciprocal_brdfs_are_refused():
     with pytest.raises(ValueError, match="terms must be between 1 and 52, got 53"):
-        separable.published.factor_symmetric(WANG, terms=53, resolution=8)
+        factor_symmetric(WANG, terms=53, resolution=8)
     with pytest.raises(ValueError, match="must be reciprocal"):
-        separable.published.factor_symmetric(lambda wi, wo: wi[..., 2:] + 0 * wo[..., 2:], terms=1, resolution=8)
+        factor_symmetric(lambda wi, wo: wi[..., 2:] + 0 * wo[..., 2:], terms=1, resolution=8)
 
 
 def test_sample_error_falls_with_the_terms_of_a_smooth_brdf():
-    brdf = separable.published.brown_plastic()
-    factored = separable.published.factor_symmetric(brdf, terms=8, resolution=16)
+    brdf = brown_plastic()
+    factored = factor_symmetric(brdf, terms=8, resolution=16)
     errors = [float(sample_error(brdf, each)[1]) for each in (factored, factored.truncate(1))]
     assert errors[0] < errors[1] < 1
+
+
+def _constant(value):
+    return lambda wi, wo: jnp.full((*wi.shape[:-1], 1), value) * jnp.ones_like(wi)
+
+
+def test_sample_error_of_closed_forms():
+    error, relative = sample_error(_constant(0.5), _constant(0.3))
+    np.testing.assert_allclose([error, relative], [0.2, 0.4], rtol=1e-5)
+    # sqrt(mean of cos_i^3 / mean of cos_i) = sqrt(1/2), and views weigh alike: sqrt(mean of cos_o^2) = sqrt(1/3).
+    samples = 5e-3
+    incident = sample_error(lambda wi, wo: wi[..., 2:], _constant(0.0))
+    assert incident[0] == pytest.approx(np.sqrt(0.5), rel=samples)
+    assert incident[1] == pytest.approx(1)
+    view = sample_error(lambda wi, wo: wo[..., 2:], _constant(0.0))
+    assert view[0] == pytest.approx(np.sqrt(1 / 3), rel=samples)
+
+
+def test_sample_error_is_the_same_at_each_call_and_finite_for_nothing():
+    first, second = (sample_error(WANG, _constant(0.0), samples=1000) for _ in range(2))
+    assert first == second
+    assert sample_error(_constant(0.0), _constant(0.0), samples=1000) == (0, 0)
+    with pytest.raises(ValueError, match="samples must be at least 1, got 0"):
+        sample_error(WANG, WANG, samples=0)

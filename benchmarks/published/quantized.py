@@ -11,7 +11,6 @@ from jaxprt.compile import jit, total
 from jaxprt.systems.separable import sparse
 from jaxprt.systems.separable.sparse import SparseTransport
 
-ALGORITHM = sparse.ALGORITHM
 _GRAY = (16,)
 _COLOR = (11, 11, 10)  # red in the highest bits
 
@@ -55,7 +54,7 @@ class QuantizedTransport(eqx.Module):
         Levels are converted to floating point one row at a time, and multiplied by their quantum after the sum.
 
         Args:
-            coefficient: Haar coefficients of the light, from `jaxprt.separable.project`.
+            coefficient: Haar coefficients of the light, from `jaxprt.separable.system.project`.
 
         Returns:
             The light-modulated tuple of Wang et al., in units of radiance.
