@@ -217,7 +217,7 @@ def report_case(name, parts: list[Part], sun, exact, lights, views, stored, prec
 
         def turn(lit=lit, texel=texel, excess=excess, eye=eye):
             return [
-                change_view(part.transport, part.visible, part.brdf, part.factored, each, texel, excess, eye)
+                change_view(part.system, part.visible, part.brdf, each, texel, excess, eye)
                 for part, each in zip(parts, lit, strict=True)
             ]
 
@@ -246,12 +246,12 @@ def measure_lobes(seen, exact, lights, views, seconds, repeats, peer, quick: boo
         parts = list(zip(seen, tables, (BRDF, GROUND), strict=True))
         for number, light in enumerate(lights):
             texel, excess, rest = bright_texels.split(light, count=sun)
-            blurred = lobe.prefilter(rest)
+            blurred = lobe.blurred_light.prefilter(rest)
 
             def turn(eye=views[0], blurred=blurred, texel=texel, excess=excess, parts=parts):
                 eye = jnp.asarray(eye)
                 return [
-                    lobe.combine(blurred, lobe.view_lobes(each, table, eye=eye))
+                    lobe.system.combine(blurred, lobe.system.view_lobes(each, table, eye=eye))
                     + bright_texels.radiance(each, brdf, texel, excess, eye=eye)
                     for each, table, brdf in parts
                 ]
@@ -261,13 +261,13 @@ def measure_lobes(seen, exact, lights, views, seconds, repeats, peer, quick: boo
                 for at, now in enumerate(turn(eye=each)):
                     square += exact[at].squares(number, place, now)
             eye = jnp.asarray(views[0])
-            view = [lobe.view_lobes(each, table, eye=eye) for each, table, _ in parts]
+            view = [lobe.system.view_lobes(each, table, eye=eye) for each, table, _ in parts]
 
             def lighten(light=light, view=view, eye=eye, parts=parts, sun=sun):
                 texel, excess, rest = bright_texels.split(light, count=sun)
-                blurred = lobe.prefilter(rest)
+                blurred = lobe.blurred_light.prefilter(rest)
                 return [
-                    lobe.combine(blurred, look) + bright_texels.radiance(each, brdf, texel, excess, eye=eye)
+                    lobe.system.combine(blurred, look) + bright_texels.radiance(each, brdf, texel, excess, eye=eye)
                     for look, (each, _, brdf) in zip(view, parts, strict=True)
                 ]
 

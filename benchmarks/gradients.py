@@ -151,7 +151,7 @@ def harmonic(vertices: int) -> Case:
     leaf, structure = jax.tree.flatten(table)
 
     def radiance(light, material, eye):
-        return harmonic_system.radiance(transport, structure.unflatten(material), light, eye=eye)
+        return prt.radiance(harmonic_system.HarmonicSystem(transport, structure.unflatten(material)), light, eye=eye)
 
     light = jax.random.normal(jax.random.key(0), (25, 3))
     return Case(radiance, {"light": light, "material": leaf, "eye": EYE}, matrix.nbytes)
@@ -164,7 +164,7 @@ def lobe(vertices: int) -> Case:
 
     def radiance(light, material, eye):
         texel, excess, rest = bright_texels.split(Environment(light), count=TEXELS)
-        color = lobe_system.radiance(transport, table.at(material), rest, eye=eye)
+        color = prt.radiance(lobe_system.LobeSystem(transport, table.at(material)), rest, eye=eye)
         model = brdf.CookTorrance(roughness=material)
         return color + bright_texels.radiance(transport, model, texel, excess, eye=eye)
 

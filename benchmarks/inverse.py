@@ -30,6 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+import jaxprt as prt
 from benchmarks import harness, path_tracing, prb
 from jaxprt import bright_texels, harmonic, inverse, lobe, reference, scene
 from jaxprt.brdf import AshikhminShirley, Lambert
@@ -91,7 +92,7 @@ def lights(mesh: Mesh, sky: Environment, view: Camera, exact: bool, store: pathl
     ready = time.perf_counter() - start
 
     def radiance(light, eye):
-        return harmonic.radiance(vectors, table, light, eye=eye)
+        return prt.radiance(harmonic.HarmonicSystem(vectors, table), light, eye=eye)
 
     for name, light in list({"of degree 4": band_limited(sky), "Grace": sky}.items())[: 1 if quick else None]:
         true = harmonic.project(light, degree=DEGREE)
@@ -178,13 +179,13 @@ class Coated:
         self.base = harmonic.tabulate(base, degree=degree, resolution=16)
         self.seconds = time.perf_counter() - start
 
-    def radiance(self, material, light: lobe.LobeLight, coefficient, eye):
+    def radiance(self, material, light: lobe.blurred_light.LobeLight, coefficient, eye):
         """Under a light, prefiltered and as harmonics."""
         table, s = self.lobes.at(jnp.log(material["nu"]), jnp.log(material["nv"])), material["specular"]
         weight, diffuse = (s * each[:1] + (1 - s) * each[1:] for each in (table.weight, table.diffuse))
         table = eqx.tree_at(lambda each: (each.weight, each.diffuse), table, (weight, diffuse))
-        glossy = lobe.combine(light, lobe.view_lobes(self.seen, table, eye=eye))
-        under = harmonic.radiance(self.shadows, self.base, coefficient, eye=eye)
+        glossy = lobe.system.combine(light, lobe.system.view_lobes(self.seen, table, eye=eye))
+        under = prt.radiance(harmonic.HarmonicSystem(self.shadows, self.base), coefficient, eye=eye)
         return glossy + material["diffuse"] * (1 - s) * under
 
 
@@ -193,7 +194,7 @@ def materials(case: Case):
     mesh, sky, views, lobes, exact, store, quick = case
     coated = Coated(mesh, lobes, sky.radiance.shape[1], FINE, store)
     texel, excess, rest = bright_texels.split(sky, count=TEXELS)
-    blurred, coefficient = lobe.prefilter(rest), harmonic.project(rest, degree=FINE)
+    blurred, coefficient = lobe.blurred_light.prefilter(rest), harmonic.project(rest, degree=FINE)
 
     def radiance(material, eye):
         single = bright_texels.radiance(coated.seen, AshikhminShirley(**material), texel, excess, eye=eye)
@@ -236,9 +237,9 @@ def together(case: Case):
     known = (whole.region == 1)[:, None]
 
     def radiance(coefficient, material, eye):
-        blurred = lobe.prefilter(Environment(value @ coefficient))
+        blurred = lobe.blurred_light.prefilter(Environment(value @ coefficient))
         own = coated.radiance(material, blurred, coefficient, eye)
-        return jnp.where(known, harmonic.radiance(coated.shadows, plain, coefficient, eye=eye), own)
+        return jnp.where(known, prt.radiance(harmonic.HarmonicSystem(coated.shadows, plain), coefficient, eye=eye), own)
 
     models = [AshikhminShirley(**BROAD), Lambert(PATCH)]
     images = [drawn(whole, models, light, view, exact, seed=n) for n, view in enumerate(views)]

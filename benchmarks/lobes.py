@@ -17,6 +17,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
+import jaxprt as prt
 from benchmarks import compression, harness
 from benchmarks.published.lobes import Remainder
 from jaxprt import bright_texels, lobe, reference, separable, visibility
@@ -77,7 +78,7 @@ def measure(quick: bool):
 
                 def frame(eye=views[0], table=table, light=light, brdf=brdf, samples=samples):
                     texel, excess, rest = bright_texels.split(light, count=SUN)
-                    color = lobe.radiance(transport, table, rest, eye=eye)
+                    color = prt.radiance(lobe.LobeSystem(transport, table), rest, eye=eye)
                     return color + bright_texels.radiance(transport, brdf, texel, excess, eye=eye, samples=samples)
 
                 color = np.stack([frame(eye) for eye in views])

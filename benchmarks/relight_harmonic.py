@@ -23,8 +23,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import jaxprt as prt
 from benchmarks import harness
 from benchmarks.precompute_separable import Recorder, embree_alone
+from benchmarks.published.harmonics import transferred_view, unshadowed_radiance, world_view
 from jaxprt import harmonic, reference, scene, visibility
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.image import interpolate, rasterize
@@ -136,22 +138,23 @@ def frame(name: str, mesh: Mesh, table, light: jax.Array, repeats: int) -> list[
     eye = mesh.position.mean(0) + 3 * (mesh.position.max(0) - mesh.position.min(0))
     matrix = jax.random.normal(jax.random.key(1), (count, 1, terms, terms))
     shadowed = TransferMatrix(matrix, mesh.position, axes)
-    view = harmonic.view_coefficients(table, mesh.position, axes, eye=eye)
-    turned, through = harmonic.world_view(axes, view), harmonic.transferred_view(shadowed, view)
-    arriving = harmonic.local_light(axes, light)
+    system = harmonic.HarmonicSystem(shadowed, table)
+    view = harmonic.system.view_coefficients(table, mesh.position, axes, eye=eye)
+    turned, through = world_view(axes, view), transferred_view(shadowed, view)
+    arriving = harmonic.system.local_light(axes, light)
     cases = {
-        "general": (lambda: harmonic.unshadowed_radiance(mesh, table, light, eye=eye), "rotation", table.nbytes),
-        "transfer": (lambda: harmonic.radiance(shadowed, table, light, eye=eye), matrix, shadowed.nbytes),
+        "general": (lambda: unshadowed_radiance(mesh, table, light, eye=eye), "rotation", table.nbytes),
+        "transfer": (lambda: prt.radiance(system, light, eye=eye), matrix, shadowed.nbytes),
         "fixed light": (
-            lambda: harmonic.combine(arriving, harmonic.view_coefficients(table, mesh.position, axes, eye=eye)),
+            lambda: system.combine(arriving, system.view(eye)),
             arriving,
             arriving.nbytes,
         ),
-        "fixed view": (lambda: harmonic.combine(light, turned), turned, turned.nbytes),
-        "fixed view, transfer": (lambda: harmonic.combine(light, through), through, through.nbytes),
+        "fixed view": (lambda: harmonic.system.combine(light, turned), turned, turned.nbytes),
+        "fixed view, transfer": (lambda: harmonic.system.combine(light, through), through, through.nbytes),
     }
     # Another order of the same products tells the rounding.
-    exact = {"transfer": harmonic.combine(harmonic.transferred_light(shadowed, light), view)}
+    exact = {"transfer": harmonic.system.combine(harmonic.system.transferred_light(shadowed, light), view)}
     exact["fixed view, transfer"] = exact["transfer"]
     lines = []
     paper = dict(
@@ -168,7 +171,7 @@ def frame(name: str, mesh: Mesh, table, light: jax.Array, repeats: int) -> list[
         rotating = isinstance(array, str)
         peer = (lambda: rotation.rotate_each(light, axes)) if rotating else harness.reader([np.asarray(array)])
         mine, theirs = harness.compare(function, peer, repeats=repeats)
-        expected = exact.get(case, harmonic.combine(arriving, view))
+        expected = exact.get(case, harmonic.system.combine(arriving, view))
 
         kept = case.startswith("fixed view")
 
@@ -217,7 +220,7 @@ def errors(quick: bool) -> list[dict]:
                 for window in WINDOWS:
                     coefficient = harmonic.project(light, degree=order - 1)
                     coefficient = harmonics.convolve(coefficient, WINDOWS[window](coefficient))
-                    call = lambda s=short, f=few, c=coefficient: harmonic.radiance(s, f, c, eye=eye)  # noqa: E731
+                    call = lambda s=short, f=few, c=coefficient: prt.radiance(harmonic.HarmonicSystem(s, f), c, eye=eye)  # noqa: E731
                     color = call()
                     lines.append(
                         {

@@ -296,7 +296,7 @@ def test_the_table_forbids(importer, imported):
         ("jaxprt", "jaxprt.systems"),
         ("jaxprt.brdf", "jaxprt.brdf.models"),
         ("jaxprt.systems.lobe", "jaxprt.systems.lobe.table"),
-        ("jaxprt.systems.lobe.relight", "jaxprt.systems.lobe.table"),
+        ("jaxprt.systems.lobe.system", "jaxprt.systems.lobe.table"),
         ("jaxprt.systems.dynamic.relight", "jaxprt.systems.lobe"),
         ("jaxprt.systems.bounces.relight", "jaxprt.systems.dynamic.relight"),
         ("jaxprt.systems.separable.sparse", "jaxprt.visibility.blocks"),

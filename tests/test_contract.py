@@ -89,7 +89,7 @@ HOST = {
     "systems.axes": "reads annotations",
     "systems.ranges": "cuts objects",
     "visibility.stored.precompute": "traces rays",
-    "systems.lobe.relight.blur": "makes numbers",
+    "systems.lobe.blurred_light.blur": "makes numbers",
     "sphere.hats.count": "a number",
     "sphere.hats.table": "SciPy tables",
     "sphere.hats.inverse_gram": "a table, on the light's device",
@@ -97,7 +97,7 @@ HOST = {
     "systems.lobe.diffuse.count": "the same",
     "systems.lobe.diffuse.vectors": "gives bytes",
     "systems.lobe.diffuse.harmonics_of": "takes bytes alone",
-    "systems.lobe.matte.matte_transport": "takes arrays apart",
+    "systems.lobe.system.matte_transport": "takes arrays apart",
     "systems.lobe.pyramid.precompute": "traces rays",
     "systems.lobe.pyramid.compress": "runs through blocks on the host",
     "systems.lobe.pyramid.bits": "cuts bytes",
@@ -111,9 +111,9 @@ HOST = {
     "systems.lobe.pyramid.scales": "NumPy tables",
     "systems.lobe.pyramid.between": "indices, of a NumPy table",
     "systems.lobe.pyramid.corners": "indices beside the weights",
-    "systems.lobe.relight.scales": "NumPy tables",
+    "systems.lobe.blurred_light.scales": "NumPy tables",
     "systems.lamps.transport": "traces rays",
-    "systems.lobe.relight.view_lobes": "gives indices beside weights, compiled in steps; lobe.radiance has them all",
+    "systems.lobe.system.view_lobes": "gives indices beside weights, compiled in steps; combine has them all",
     "systems.lobe.widened": "views and sums of systems; tests/systems/lobe/test_widened.py",
     "systems.bounces.traced.is_sharp": "decides on the host",
     "systems.bounces.traced.fraction": "NumPy on the host",
@@ -133,9 +133,7 @@ HOST = {
     "systems.harmonic.transfer.precompute_diffuse": "traces rays",
     "systems.harmonic.transfer.check": "checks values",
     "systems.harmonic.transfer.check_memory": "the same",
-    "systems.harmonic.clustered.precompute_clustered": "traces rays",
     "systems.harmonic.exchange": "reads and writes files",
-    "systems.harmonic.clustered.compress": "gives vectors of either sign",
     "systems.bright_texels.samples_for": "compares rules on the host",
     "systems.adaptive": "integrates cells that a loop chooses; reference.integrate has them all",
     "sphere.cubemap.axes": "a NumPy table of axes",
@@ -168,7 +166,6 @@ HOST = {
     "systems.lobe.table.tabulate": "checks values, and chooses the number of lobes by them",
     "systems.lobe.table.sampled": "checks values",
     "systems.lobe.table.measured_error": "gives a Python number",
-    "systems.lobe.knots": "takes indices; tested through tables over parameters",
     "systems.lobe.table.is_isotropic": "compares values",
     "systems.dynamic.brdf_set.separate": "checks values",
     "systems.dynamic.brdf_set.factor": "the same",
@@ -442,11 +439,6 @@ class Draw:
     def harmonic(self, *nodes):
         """A BRDF in four harmonics, over the view angle or on a map."""
         return harmonic_system.HarmonicBrdf(self.normal(4, 3, *(nodes or (5, 5))), (), self.uniform())
-
-    def clustered_transfer(self):
-        """Two clusters of two vertices, of degree 1, with one component."""
-        parts = self.normal(2, 9), self.normal(2, 1, 9), self.normal(2, 2, 1), self.normal(3, 3), self.rotation(3)
-        return harmonic_system.ClusteredTransfer(*parts, jnp.array([0, 3, 1]), self.uniform(2), self.uniform(2))
 
     def matrix(self, vertices=3):
         """Transfer of the same four harmonics."""
@@ -805,9 +797,6 @@ EXAMPLES = {
     "systems.harmonic.transfer.transfer": example(
         lambda draw: call(draw.seen(2), draw.rotation(2)), gradient=(), degree=2
     ),
-    "systems.harmonic.clustered.clustered_light": example(
-        lambda draw: call(draw.clustered_transfer(), draw.normal(4, 3)), gradient=("transport", "light"), batch=False
-    ),
     "systems.harmonic.transfer.visible": example(lambda draw: call(draw.seen(2), draw.rotation(2)), degree=2),
     "systems.harmonic.transfer.transfer_diffuse": example(lambda draw: call(draw.seen(2), draw.rotation(2)), degree=2),
     "systems.harmonic.transfer.from_visibility": example(
@@ -886,7 +875,7 @@ EXAMPLES = {
         gradient=("materials", "light", "eye"),
         texels=3,
     ),
-    "systems.lobe.narrow.share": example(lambda draw: call(10 + 10 * draw.uniform(5))),
+    "systems.lobe.table.traced_share": example(lambda draw: call(10 + 10 * draw.uniform(5))),
     "systems.bounces.relight.area_mean": example(lambda draw: call(draw.normal(5, 2, 3), draw.uniform(5))),
     "systems.bounces.gather.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
     "systems.lamps.relight.beside": example(
@@ -902,50 +891,35 @@ EXAMPLES = {
     ),
     "systems.lobe.diffuse.coefficients": example(lambda draw: call(draw.normal(6, 8, 8, 3))),
     "systems.lobe.diffuse.irradiance": example(lambda draw: call(draw.normal(8, 3), draw.normal(8, 5))),
-    "systems.lobe.relight.prefilter": example(lambda draw: call(draw.light(8))),
-    "systems.lobe.relight.combine": example(
+    "systems.lobe.blurred_light.prefilter": example(lambda draw: call(draw.light(8))),
+    "systems.lobe.system.combine": example(
         lambda draw: call(
-            lobe_system.prefilter(draw.light(8)),
-            lobe_system.view_lobes(each := draw.pyramid(), draw.lobes(), eye=draw.above(each)),
+            lobe_system.blurred_light.prefilter(draw.light(8)),
+            lobe_system.system.view_lobes(each := draw.pyramid(), draw.lobes(), eye=draw.above(each)),
         )
     ),
-    "systems.lobe.relight.radiance": example(
-        lambda draw: call(each := draw.pyramid(), draw.lobes(), draw.light(8), eye=draw.above(each)),
-        # Frames have derivatives along rotations only; see sphere.rotation.
-        gradient=("brdf", "light", "eye"),
-    ),
-    "systems.harmonic.relight.project": example(lambda draw: call(draw.light()), degree=2),
-    "systems.harmonic.relight.radiance": example(
-        lambda draw: call(each := draw.matrix(), draw.harmonic(), draw.normal(4, 3), eye=draw.above(each)),
-        gradient=("brdf", "light", "eye"),
-    ),
-    "systems.harmonic.relight.unshadowed_radiance": example(
+    "systems.harmonic.system.project": example(lambda draw: call(draw.light()), degree=2),
+    "benchmarks.published.harmonics.unshadowed_radiance": example(
         lambda draw: call(draw.mesh(), draw.harmonic(), draw.normal(4, 3), eye=draw.camera().eye),
         gradient=("brdf", "light", "eye"),
     ),
-    "systems.harmonic.relight.diffuse_radiance": example(
-        lambda draw: call(
-            harmonic_system.TransferVector(draw.normal(4, 1, 3), draw.normal(3, 3)), draw.uniform(3), draw.normal(4, 3)
-        ),
-        gradient=("albedo", "light"),
-    ),
-    "systems.harmonic.relight.probe_light": example(
+    "systems.harmonic.system.probe_light": example(
         lambda draw: call(draw.normal(5, 3), draw.normal(2, 3), draw.normal(2, 4, 3))
     ),
     # Rotations have derivatives along rotations only; see sphere.rotation.
-    "systems.harmonic.relight.local_light": example(
+    "systems.harmonic.system.local_light": example(
         lambda draw: call(draw.rotation(5), draw.normal(4, 3)), gradient=("light",)
     ),
-    "systems.harmonic.relight.world_view": example(
+    "benchmarks.published.harmonics.world_view": example(
         lambda draw: call(draw.rotation(5), draw.normal(4, 3, 5)), gradient=("view",)
     ),
-    "systems.harmonic.relight.transferred_light": example(
+    "systems.harmonic.system.transferred_light": example(
         lambda draw: call(draw.matrix(), draw.normal(4, 3)), gradient=("light",)
     ),
-    "systems.harmonic.relight.transferred_view": example(
+    "benchmarks.published.harmonics.transferred_view": example(
         lambda draw: call(draw.matrix(), draw.normal(4, 3, 3)), gradient=("view",)
     ),
-    "systems.harmonic.relight.view_coefficients": example(
+    "systems.harmonic.system.view_coefficients": example(
         lambda draw: call(draw.harmonic(5), (m := draw.matrix()).position, m.frame, eye=draw.above(m)),
         gradient=("brdf", "position", "eye"),
     ),
@@ -959,7 +933,7 @@ EXAMPLES = {
         ),
         gradient=("brdf", "position", "materials", "eye"),
     ),
-    "systems.harmonic.relight.combine": example(lambda draw: call(draw.normal(4, 3), draw.normal(4, 1, 5))),
+    "systems.harmonic.system.combine": example(lambda draw: call(draw.normal(4, 3), draw.normal(4, 1, 5))),
     "systems.separable.system.project": example(lambda draw: call(draw.light())),
     "benchmarks.published.coefficients.choose_by_magnitude": example(
         lambda draw: call(draw.normal(24, 3)), threshold=9000

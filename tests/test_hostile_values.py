@@ -416,7 +416,7 @@ def system_verbs() -> dict[str, Verb]:
         ),
         "harmonic.project": Verb(prt.harmonic.project, light=environment(), degree=2),
         "lobe.precompute": Verb(prt.lobe.precompute, **common, **quiet),
-        "lobe.prefilter": Verb(prt.lobe.prefilter, light=environment()),
+        "lobe.blurred_light.prefilter": Verb(prt.lobe.blurred_light.prefilter, light=environment()),
         "lobe.tabulate": Verb(prt.lobe.tabulate, brdf=model, lobes=1, error=None, resolution=8, knot=()),
         "separable.factor": Verb(prt.separable.factor, brdf=model, terms=1, error=None, light=None, resolution=8),
         "separable.system.project": Verb(prt.separable.system.project, light=environment()),

@@ -32,12 +32,12 @@ def harmonic(mesh, visible, eye):
     seen = jnp.asarray(visible.seen(np.arange(len(visible.position))))
     matrix = prt.harmonic.transfer.transfer(seen, visible.frame, degree=2)
     transport = prt.harmonic.TransferMatrix(matrix[:, None], visible.position, visible.frame)
-    return prt.harmonic.radiance(transport, table, prt.harmonic.project(WHITE, degree=2), eye=eye)
+    return prt.radiance(prt.harmonic.HarmonicSystem(transport, table), WHITE, eye=eye)
 
 
 def lobe(mesh, visible, eye):
     table = prt.lobe.tabulate(prt.brdf.Lambert(ALBEDO), lobes=1, resolution=4)
-    return prt.lobe.radiance(prt.lobe.compress(visible), table, WHITE, eye=eye)
+    return prt.radiance(prt.lobe.LobeSystem(prt.lobe.compress(visible), table), WHITE, eye=eye)
 
 
 def texels(mesh, visible, eye):

@@ -14,6 +14,7 @@ import numpy as np
 from benchmarks import harness, relight_harmonic
 from benchmarks.figures import drawing
 from benchmarks.figures.run import LIGHTS, Clock, Run
+from benchmarks.published.harmonics import unshadowed_radiance
 from jaxprt import harmonic, image, reference
 from jaxprt.brdf import AshikhminShirley, Phong, PoulinFournier, load_scattered
 from jaxprt.scene import Camera, Environment, Mesh, camera
@@ -46,7 +47,7 @@ def unshadowed(
     table = tabulated(run, brdf) if table is None else table
     shaded = drawing.shaded(mesh, view)
     coefficient = harmonic.project(light, degree=DEGREE)
-    color = harmonic.unshadowed_radiance(shaded.point, table, coefficient, eye=view.eye)
+    color = unshadowed_radiance(shaded.point, table, coefficient, eye=view.eye)
     number = drawing.some(shaded.point, view.eye, 20 if run.quick else POINTS)
     exact = drawing.unshadowed(shaded.point, brdf, light, view.eye, number)
     return shaded.picture(color), measured(color[number], exact)

@@ -17,7 +17,7 @@ from jaxprt.brdf import Lambert
 from jaxprt.relit.channels import Shading
 from jaxprt.scene import Mesh
 from jaxprt.systems import axes, bright_texels, harmonic, lobe, separable, standard
-from jaxprt.systems.lobe import LobeTransport
+from jaxprt.systems.lobe import LobeTransport, diffuse, pyramid
 from jaxprt.systems.protocol import System
 from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.systems.standard import StandardTable
@@ -144,8 +144,8 @@ class Lobes(eqx.Module):
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
         """Smallest number of bytes: transfer vectors, and visibility as pyramids, or as bits for a Lambertian part."""
         if isinstance(shading.brdf, Lambert):
-            return vertices * (6 * size**2 // 8 + lobe.diffuse.count(size))
-        return vertices * (lobe.pyramid.scales(size).total + lobe.diffuse.count(size))
+            return vertices * (6 * size**2 // 8 + diffuse.count(size))
+        return vertices * (pyramid.scales(size).total + diffuse.count(size))
 
 
 class Harmonics(eqx.Module):
@@ -255,7 +255,7 @@ class Clusters(eqx.Module):
         options = {**sizes, **target.options("clusters")}
         transport = separable.clustered.precompute(visible, factored, clusters=clusters, **options)
         system = separable.SeparableSystem(transport, factored)
-        return _bright(system, lobe.bits(known.pyramid), shading, self.texels, visible.size)
+        return _bright(system, pyramid.bits(known.pyramid), shading, self.texels, visible.size)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
         """Number of bytes of the texels' visibility, the weights, cores and modes, and the maps of a gray BRDF."""

@@ -349,13 +349,14 @@ def total(*systems: System) -> Total:
 
 @promoted
 def radiance(
-    system: System, environment: Environment, *, eye: Float[Array | np.ndarray, "3"], materials: PyTree = None
+    system: System, environment: Environment | PyTree, *, eye: Float[Array | np.ndarray, "3"], materials: PyTree = None
 ) -> Float[Array, "*l v c"]:
     """Radiance that each vertex sends to the eye. Calls the four methods of any system in order.
 
     Args:
         system: The system.
-        environment: The light, or a batch of them along leading axes.
+        environment: The light, or a batch of them along leading axes; or one light in another form that the system's
+            `light` takes, such as SH coefficients.
         eye: Position of the viewer in world units.
         materials: Materials of the vertices, as a `Blend` or as the system documents; None for those of the BRDF.
 
@@ -369,11 +370,13 @@ def radiance(
         ValueError: A batch is empty, or a method of the system raises it.
     """
     _check(system)
-    environment = one_light(environment, batch=True)
-    *batch, faces, rows, columns, colors = environment.radiance.shape
     eye = require.position("the eye", origins.local("the eye", eye, system.origin))
     system = system.centered()
     view = system.view(eye, materials)
+    if not isinstance(environment, Environment):
+        return system.combine(system.shade(system.light(environment), materials), view)
+    environment = one_light(environment, batch=True)
+    *batch, faces, rows, columns, colors = environment.radiance.shape
     if not batch:
         return system.combine(system.shade(system.light(environment), materials), view)
     if not math.prod(batch):

@@ -14,7 +14,7 @@ from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import TexturedMaterial
 from jaxprt.scene.material import Texture
 from jaxprt.systems import harmonic, lobe, standard
-from jaxprt.systems.lobe import pyramid, relight
+from jaxprt.systems.lobe import blurred_light, pyramid
 from jaxprt.view import matrices
 from jaxprt.view.reduced import (
     Exported,
@@ -148,10 +148,10 @@ def mips(size: int) -> list[int]:
 
 
 def blurring(size: int) -> dict[str, Any]:
-    """Parameters for blurring the light to all lobe widths, as `jaxprt.systems.lobe.relight.prefilter` does."""
-    scale = relight.scales(size)
+    """Parameters for blurring the light to all lobe widths, as `jaxprt.systems.lobe.blurred_light.prefilter` does."""
+    scale = blurred_light.scales(size)
     pairs = zip(scale.edge.tolist(), scale.spread.tolist(), strict=True)
-    source, own, concentration = zip(*(relight.blur(*each, size=size) for each in pairs), strict=True)
+    source, own, concentration = zip(*(blurred_light.blur(*each, size=size) for each in pairs), strict=True)
     return {
         "edges": scale.edge.tolist(),
         "spreads": scale.spread.tolist(),
@@ -159,7 +159,7 @@ def blurring(size: int) -> dict[str, Any]:
         "total": scale.total,
         "sources": source,
         "concentrations": concentration,
-        "reaches": [min(np.pi, relight.REACH * np.sqrt(each)) for each in own],
+        "reaches": [min(np.pi, blurred_light.REACH * np.sqrt(each)) for each in own],
     }
 
 

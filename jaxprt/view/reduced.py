@@ -14,7 +14,8 @@ from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment
 from jaxprt.sphere import cubemap
 from jaxprt.systems import axes, bright_texels, harmonic, lobe
-from jaxprt.systems.lobe import pyramid
+from jaxprt.systems.lobe import diffuse, pyramid
+from jaxprt.systems.lobe.blurred_light import LobeLight
 from jaxprt.systems.protocol import System
 from jaxprt.view import matrices
 
@@ -50,7 +51,7 @@ class CoarseTransport(lobe.LobeTransport):
 class CoarseSystem(lobe.LobeSystem):
     """A lobe system that reduces the resolution of its light, and lights diffuse parts by harmonics."""
 
-    def light(self, environment: Environment) -> lobe.LobeLight:
+    def light(self, environment: Environment) -> LobeLight:
         """The light at reduced resolution, blurred for lobes."""
         light = super().light(resized(environment, size=self.transport.size))
         coefficient = harmonic.project(environment, degree=_DEGREE)
@@ -150,7 +151,7 @@ def _bits(system: System) -> UInt8[np.ndarray, "v n"] | None:
     if not isinstance(system, bright_texels.BrightTexels) or isinstance(system.system, harmonic.HarmonicSystem):
         return None
     seen = system.visibility
-    if isinstance(seen, lobe.TexelBits):
+    if isinstance(seen, pyramid.TexelBits):
         return np.asarray(seen.bit).T
     if isinstance(seen, lobe.LobeTransport):
         return np.asarray(seen.pyramid)[:, : 6 * seen.size**2 // 8]
@@ -180,7 +181,7 @@ def _exported(name: str, system: System) -> Exported:
     own = system.system if isinstance(system, bright_texels.BrightTexels) else system
     if isinstance(own, lobe.MatteSystem):
         matte = own.transport
-        vector = lobe.diffuse.harmonics_of(matte.vector, size=matte.size, degree=_DEGREE)
+        vector = diffuse.harmonics_of(matte.vector, size=matte.size, degree=_DEGREE)
         transport = harmonic.TransferVector(vector[:, None], put(matte.position))
         own = harmonic.DiffuseSystem(transport, put(own.albedo))
     if not isinstance(own, Exported):
@@ -229,7 +230,7 @@ def vectors_of(system: Exported) -> Float[np.ndarray, "lm v"]:
         return np.zeros((0, system.vertices))
     found = system.transport.vector
     if isinstance(system, lobe.LobeSystem) and not isinstance(system.transport, CoarseTransport):
-        found = lobe.diffuse.harmonics_of(found, size=system.transport.size, degree=_DEGREE)
+        found = diffuse.harmonics_of(found, size=system.transport.size, degree=_DEGREE)
     if isinstance(system, harmonic.DiffuseSystem):
         if found.shape[1] != 1:
             raise ValueError(f"transfer vectors must be gray to be exported, got {found.shape[1]} colors")

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.published.harmonics import unshadowed_radiance
 from jaxprt import harmonic, inverse
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.image import render
@@ -38,7 +39,7 @@ def sky():
 
 
 def lit_by(mesh, table):
-    return lambda light, eye: harmonic.unshadowed_radiance(mesh, table, light, eye=eye)
+    return lambda light, eye: unshadowed_radiance(mesh, table, light, eye=eye)
 
 
 def drawn(mesh, radiance, parameters, cameras, **options):

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxprt as prt
+from benchmarks.published.harmonics import unshadowed_radiance
 from jaxprt import harmonic, inverse, lobe
 from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert
 from jaxprt.image import rasterize, render
@@ -42,7 +44,7 @@ def dull(mesh):
     @functools.cache
     def of(degree):
         cut = table.truncate(degree=degree)
-        return lambda light, eye: harmonic.unshadowed_radiance(mesh, cut, light, eye=eye)
+        return lambda light, eye: unshadowed_radiance(mesh, cut, light, eye=eye)
 
     return of
 
@@ -50,7 +52,7 @@ def dull(mesh):
 @pytest.fixture(scope="module")
 def matte(mesh):
     table = harmonic.tabulate(Lambert(0.5), degree=4, resolution=8)
-    return lambda light, eye: harmonic.unshadowed_radiance(mesh, table, light, eye=eye)
+    return lambda light, eye: unshadowed_radiance(mesh, table, light, eye=eye)
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +78,7 @@ def test_a_sharp_material_tells_all_of_it(mesh, sky, view):
     table = harmonic.tabulate(AshikhminShirley(diffuse=0.0, nu=200.0, nv=200.0), degree=4, resolution=8)
 
     def shiny(light, eye):
-        return harmonic.unshadowed_radiance(mesh, table, light, eye=eye)
+        return unshadowed_radiance(mesh, table, light, eye=eye)
 
     image = render(mesh, shiny(sky, view.eye), view, samples=1)
     found = fit(mesh, shiny, Picture(image, view, mask=image.min(-1) >= 0))
@@ -235,7 +237,7 @@ def test_a_mirror_like_material_is_found_from_a_matte_start(mesh, view, monkeypa
     )
 
     def radiance(m, eye):
-        return m["weight"] * lobe.radiance(seen, table.at(jnp.log(m["roughness"])), light, eye=eye)
+        return m["weight"] * prt.radiance(lobe.LobeSystem(seen, table.at(jnp.log(m["roughness"]))), light, eye=eye)
 
     true = {"weight": jnp.array(0.8), "roughness": jnp.array(0.03)}
     image = render(mesh, radiance(true, view.eye), view, samples=1)

@@ -77,7 +77,7 @@ def test_light_from_a_picture_of_as_many_pixels_agrees_with_float64(side):
     true = prt.harmonic.project(LIGHT, degree=2)
 
     def radiance(light, eye):
-        return prt.harmonic.diffuse_radiance(transport, jnp.full(1, 0.5), light)
+        return prt.radiance(prt.harmonic.DiffuseSystem(transport, jnp.full(1, 0.5)), light, eye=eye)
 
     image = np.asarray(render(mesh, radiance(true, camera.eye), camera, samples=1))
     found = inverse.light(radiance, jnp.zeros_like(true), inverse.observe(mesh, [inverse.Picture(image, camera)]))

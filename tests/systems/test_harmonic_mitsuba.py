@@ -18,6 +18,7 @@ import trimesh
 from jaxtyping import Array, Float
 
 import jaxprt as prt
+from benchmarks.published.harmonics import unshadowed_radiance
 from jaxprt import harmonic
 from jaxprt.scene.environment import environment_from_image
 from jaxprt.systems.harmonic import interreflect, interreflect_diffuse, precompute, precompute_diffuse, tabulate
@@ -54,6 +55,14 @@ LOBES = [  # Direction and color; all so broad that a thousandth of them lies ab
     ((0.3, -1.0, 0.4), (0.2, 1.0, 1.0)),
 ]
 SHARPNESS = 2.0
+
+
+def relight(transport, table, light, *, eye):
+    return prt.radiance(harmonic.HarmonicSystem(transport, table), light, eye=eye)
+
+
+def diffuse(transport, albedo, light):
+    return prt.radiance(harmonic.DiffuseSystem(transport, albedo), light, eye=jnp.zeros(3))
 
 
 def latlong(latitude):
@@ -262,12 +271,12 @@ def ours(scene, light, matrix):
     result = {}
     bounced = interreflect_diffuse(mesh, vector, np.array([ALBEDO]), bounces=BOUNCES, size=BOUNCED, progress=False)
     for bounces, transport in ((0, vector), (BOUNCES, bounced)):
-        result["vector", bounces] = harmonic.diffuse_radiance(transport, jnp.asarray(ALBEDO), light)[scene.vertex]
+        result["vector", bounces] = diffuse(transport, jnp.asarray(ALBEDO), light)[scene.vertex]
     for name, brdf in (("matrix", prt.brdf.Lambert(ALBEDO)), ("glossy", GLOSS)):
         table = tabulate(brdf, degree=DEGREE, resolution=16)
         bounced = interreflect(mesh, matrix, [table], bounces=BOUNCES, size=BOUNCED, progress=False)
         for bounces, transport in ((0, matrix), (BOUNCES, bounced)):
-            result[name, bounces] = harmonic.radiance(transport, table, light, eye=eye)[scene.vertex]
+            result[name, bounces] = relight(transport, table, light, eye=eye)[scene.vertex]
     return result
 
 
@@ -321,7 +330,7 @@ def test_one_bounce_for_two_would_be_noticed(scene, light, ours, estimates):
     mesh = scene.mesh()
     vector = precompute_diffuse(mesh, degree=DEGREE, size=32, progress=False)
     once = interreflect_diffuse(mesh, vector, np.array([ALBEDO]), bounces=1, size=BOUNCED, progress=False)
-    color = harmonic.diffuse_radiance(once, jnp.asarray(ALBEDO), light)[scene.vertex]
+    color = diffuse(once, jnp.asarray(ALBEDO), light)[scene.vertex]
     assert excess(color, *estimates["matte", BOUNCES]) > 0
 
 
@@ -333,12 +342,12 @@ def test_another_brdf_would_be_noticed(ours, estimates):
 def test_missing_shadows_would_be_noticed(scene, light, estimates):
     table = tabulate(prt.brdf.Lambert(ALBEDO), degree=DEGREE, resolution=16)
     eye = jnp.asarray(EYE, jnp.float32)
-    color = harmonic.unshadowed_radiance(scene.mesh(), table, light, eye=eye)[scene.vertex]
+    color = unshadowed_radiance(scene.mesh(), table, light, eye=eye)[scene.vertex]
     assert excess(color, *estimates["matte", 0]) > 0
 
 
 def test_turned_light_would_be_noticed(scene, matrix, estimates):
     table = tabulate(prt.brdf.Lambert(ALBEDO), degree=DEGREE, resolution=16)
     light = harmonic.project(environment_from_image(IMAGE[:, ::-1], size=32), degree=DEGREE)
-    color = harmonic.radiance(matrix, table, light, eye=jnp.asarray(EYE, jnp.float32))[scene.vertex]
+    color = relight(matrix, table, light, eye=jnp.asarray(EYE, jnp.float32))[scene.vertex]
     assert excess(color, *estimates["matte", 0]) > 0

@@ -148,12 +148,6 @@ def matrices(name: str, model: str) -> tuple[prt.System, Any]:
     return harmonic.HarmonicSystem(transport, harmonic_table(model)), None
 
 
-def clustered_matrices(name: str, model: str) -> tuple[prt.System, Any]:
-    options = {"degree": 4, "size": SIZE, "progress": False, "clusters": max(1, len(mesh(name).position) // 24)}
-    transport = harmonic.precompute_clustered(mesh(name), components=3 if name == "triangle" else 20, **options)
-    return harmonic.ClusteredSystem(transport, harmonic_table(model)), None
-
-
 def vectors(name: str, model: str) -> tuple[prt.System, Any]:
     transport = harmonic.precompute_diffuse(mesh(name), degree=4, size=SIZE, progress=False)
     return harmonic.DiffuseSystem(transport, jnp.ones(1) if model == "white" else jnp.full(1, 0.5)), None
@@ -210,7 +204,6 @@ MADE = {
     "separable": Promise(sparse, 0.01, 0.1),
     "separable, clustered": Promise(clustered, 0.02, 0.1),
     "harmonic": Promise(matrices, 0.02, 0.25),
-    "harmonic, clustered": Promise(clustered_matrices, 0.02, 0.25),
     "harmonic, diffuse": Promise(vectors, 0.02, None),
     "lobe": Promise(lobes, 0.02, 0.1),
     "lobe, matte": Promise(mattes, 0.02, None),
@@ -265,7 +258,6 @@ def test_a_white_surface_in_a_white_furnace_is_white(name):
 # have texels wider than narrow lobes and hold wide ones alone.
 METALS = {
     "harmonic": {0.05: (0.06, 0.25), 0.3: (0.01, 0.03), 1.0: (0.01, 0.02)},
-    "harmonic, clustered": {0.05: (0.06, 0.25), 0.3: (0.01, 0.03), 1.0: (0.01, 0.02)},
     "lobe": {0.05: (0.15, 0.6), 0.3: (0.021, 0.085), 1.0: (0.01, 0.04)},
     "lobe, bright texels": {0.05: (0.15, 0.6), 0.3: (0.021, 0.085), 1.0: (0.01, 0.04)},
     "separable": {1.0: (0.02, 0.04)},
@@ -756,7 +748,7 @@ def random_blend(system: prt.System) -> prt.Blend:
     return prt.Blend(np.random.default_rng(0).uniform(size=(system.vertices, 3, 3)).astype(np.float32))
 
 
-BLENDED = ["separable", "harmonic", "harmonic, clustered", "lobe", "lobe, bright texels"]
+BLENDED = ["separable", "harmonic", "lobe", "lobe, bright texels"]
 
 
 @pytest.mark.parametrize("name", BLENDED)

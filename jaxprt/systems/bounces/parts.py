@@ -52,13 +52,13 @@ class ReflectingPart(eqx.Module):
         self, eye: Float[Array, "*p 3"], blend: Blend | None, points: Points | None = None
     ) -> Float[Array, "lm _ _"]:
         """Harmonics of the BRDF at each vertex or point for its view direction. `blend` holds the weights there."""
-        return harmonic.blended_view(self.brdf, *placed(self.position, self.frame, points), blend, eye=eye)
+        return harmonic.system.blended_view(self.brdf, *placed(self.position, self.frame, points), blend, eye=eye)
 
     def combine(
         self, light: Float[Array, "lm _ _"], view: Float[Array, "lm _ _"], points: Points | None = None
     ) -> Float[Array, "_ e"]:
         """Radiance of reflected light. `light` is what arrives at the vertices."""
-        return harmonic.combine(light if points is None else points.carry(light, axis=2), view)
+        return harmonic.system.combine(light if points is None else points.carry(light, axis=2), view)
 
 
 class Members(eqx.Module):
@@ -199,7 +199,7 @@ def _arriving(
         change = _stacked([zero if each is None else each for each, zero in pairs])[system.place]
     arriving = collect(system.tensor, light, weight, change=change, lamp=lamp)
     pairs = zip(system.group, system.members, strict=True)
-    return tuple(harmonic.local_light(own.frame, arriving[..., members.vertex]) for own, members in pairs)
+    return tuple(harmonic.system.local_light(own.frame, arriving[..., members.vertex]) for own, members in pairs)
 
 
 def _stacked(rows: Sequence[Float[Array, "_ _"]]) -> Float[Array, "_ c"]:

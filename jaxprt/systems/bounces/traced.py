@@ -1,7 +1,7 @@
 """Reflections that are too sharp for sixteen harmonics: the lobes that rays represent instead, and their directions.
 
 The average of light over a von Mises-Fisher lobe of concentration k scales its band l by A_l(k). Arriving light has few
-bands, so narrow lobes lose what higher bands would contribute; these lobes are traced. `share` gives the traced
+bands, so narrow lobes lose what higher bands would contribute; these lobes are traced. `traced_share` gives the traced
 fraction of each lobe, a smooth function of its concentration. The same fraction is subtracted from the harmonics of the
 BRDF, where a lobe has the coefficients weight * A_l(k) * Y(center). Nothing is counted twice.
 
@@ -26,8 +26,7 @@ from jaxprt.sphere import directions, harmonics
 from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.bounces.parts import ReflectingPart
 from jaxprt.systems.lobe import LobeBrdf
-from jaxprt.systems.lobe.narrow import share
-from jaxprt.systems.lobe.table import Lobes
+from jaxprt.systems.lobe.table import Lobes, traced_share
 from jaxprt.systems.protocol import Blend
 
 FEW = 0.55  # smallest traced fraction of what a BRDF's lobes reflect for which rays are traced
@@ -151,7 +150,7 @@ def albedos(table: LobeBrdf) -> Float[Array, "3 c *k"]:
         area = jnp.ones_like(radius)
     # Projected solid angle in the parabolic map, whose radius is the tangent of half the angle.
     area = area * jnp.maximum(1 - radius**2, 0) / (1 + radius**2) ** 3
-    traced = jnp.sum(table.weight * share(jnp.exp(table.scale)), 1)
+    traced = jnp.sum(table.weight * traced_share(jnp.exp(table.scale)), 1)
     every = jnp.stack([traced, jnp.sum(table.weight, 1), table.diffuse])
     return jnp.sum(every * area, tuple(range(-len(views), 0)))
 
@@ -194,7 +193,7 @@ def _looked_up(table: LobeBrdf, position: Array, frame: Array, eye: Array, param
 
 def _strength(lobes: Lobes, blend: Blend | None, seen: Array | None) -> Float[Array, "c l v"]:
     """Weight of the traced fraction of each lobe in each color."""
-    traced = share(lobes.concentration)
+    traced = traced_share(lobes.concentration)
     weight = lobes.weight * (traced if seen is None else traced * seen)
     if blend is None:
         return weight
@@ -204,7 +203,7 @@ def _strength(lobes: Lobes, blend: Blend | None, seen: Array | None) -> Float[Ar
 @partial(jit, static_argnames="count")
 def _chosen(lobes: Lobes, seen: Array | None, position: Array, frame: Array, *, count: int) -> Rays:
     """Quantiles of the mixture of the narrow lobes, rotated by a random angle at each point."""
-    mass = jnp.maximum(jnp.sum(lobes.weight, 0), 0) * share(lobes.concentration)
+    mass = jnp.maximum(jnp.sum(lobes.weight, 0), 0) * traced_share(lobes.concentration)
     total = jnp.sum(mass if seen is None else mass * seen, 0)
     chance = jnp.where(total > 0, mass / jnp.where(total > 0, total, 1), 0)
     above = jnp.cumsum(chance, 0)

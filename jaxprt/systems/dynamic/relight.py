@@ -21,10 +21,12 @@ from jaxprt import require
 from jaxprt.compile import isolated, jit
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
-from jaxprt.systems import bright_texels, lobe, protocol
+from jaxprt.systems import bright_texels, protocol
 from jaxprt.systems.dynamic.brdf_set import DynamicBrdf, Mixed
 from jaxprt.systems.dynamic.transport import DynamicTransport, RegionTransport
-from jaxprt.systems.lobe import LobeLight, LobeView
+from jaxprt.systems.lobe import system as lobe
+from jaxprt.systems.lobe.blurred_light import LobeLight
+from jaxprt.systems.lobe.system import LobeView
 from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.systems.separable import system as separable
 from jaxprt.systems.separable.factorization import check_mark

@@ -19,7 +19,7 @@ from jaxprt import require, visibility
 from jaxprt.scene.mesh import Mesh
 from jaxprt.systems import lobe, separable
 from jaxprt.systems.dynamic.brdf_set import DynamicBrdf
-from jaxprt.systems.lobe import LobeTransport
+from jaxprt.systems.lobe import LobeTransport, pyramid
 from jaxprt.systems.separable import ClusteredTransport, SeparableBrdf
 from jaxprt.visibility import StoredVisibility
 from jaxprt.visibility.arguments import PRECOMPUTE
@@ -122,7 +122,7 @@ def precompute(
             raise TypeError(
                 f"each BRDF must be made by jaxprt.dynamic.factor or jaxprt.separable.factor, got {type(brdf).__name__}"
             )
-    lobe.pyramid.scales(size)
+    pyramid.scales(size)
     regions = []
     for number, brdf in zip(numbers.tolist(), brdfs, strict=True):
         vertex = np.flatnonzero(np.asarray(mesh.region) == number)

@@ -323,7 +323,7 @@ def check_memory(vertices: int, degree: int, *, copies: int = 1, colors: int = 1
     require.memory(
         f"transfer matrices of degree {degree} for {vertices:,} vertices, {each:,} bytes each,",
         copies * vertices * each,
-        "take jaxprt.harmonic.precompute_clustered, a lower degree, or fewer vertices (vertex=)",
+        "take a lower degree, or fewer vertices (vertex=)",
         in_files=in_files,
     )
 

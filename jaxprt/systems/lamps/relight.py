@@ -34,8 +34,7 @@ from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import directions
 from jaxprt.systems.lamps.transport import LampTransport
 from jaxprt.systems.lobe import LobeBrdf
-from jaxprt.systems.lobe.narrow import share
-from jaxprt.systems.lobe.table import Lobes
+from jaxprt.systems.lobe.table import Lobes, traced_share
 from jaxprt.systems.protocol import Blend, check_blend
 
 _SMALL, _LARGE = 0.5, 2.0  # squared chords, in variances of the lobe, between which the two approximations blend
@@ -192,7 +191,7 @@ def _sent(lobe: Lobes, frame: Array, traced: Array | None, piece: tuple[Array, .
     chord = 4 * jnp.clip(1 - length / jnp.maximum(solid, _TINY), 0, 1)
     density = met(lobe.mean, lobe.concentration, toward, chord)
     if traced is not None:
-        density = density * (1 - traced * share(lobe.concentration) * beside(lobe.concentration, whole))
+        density = density * (1 - traced * traced_share(lobe.concentration) * beside(lobe.concentration, whole))
     return jnp.sum(lobe.weight * density, 1) * solid + lobe.diffuse * matte
 
 

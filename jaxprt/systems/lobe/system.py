@@ -1,30 +1,73 @@
-"""The lobe system: `light`, `shade`, `view` and `combine` for BRDFs as lobes."""
+"""The lobe system: the texels of the blurred light that each lobe reads, and how much of them is visible.
+
+Light L and visibility V are correlated over a lobe. The visible part of a lobe is treated as a narrower lobe around
+another direction. For a normal distribution of variance k, the mean of the visible part is shifted by k grad E[V] /
+E[V] (Stein's lemma); the gradient comes from the bilinear lookup of visibility. Assuming that the occluder is a
+straight edge, the shift also determines the variance that remains across the edge. E[L V] is then E[V] times the light
+blurred to that width, read at the shifted mean. This is exact for light that is linear over the lobe, and never
+negative.
+"""
 
 import dataclasses
-from functools import reduce
+from functools import partial, reduce
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, UInt8
 
 from jaxprt import require
+from jaxprt.compile import isolated, jit, promoted, total
+from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
+from jaxprt.scene.points import Points, placed
+from jaxprt.sphere import cubemap, directions
 from jaxprt.systems import protocol
 from jaxprt.systems.lobe import diffuse
-from jaxprt.systems.lobe.pyramid import LobeTransport
-from jaxprt.systems.lobe.relight import LobeLight, LobeView, combine, prefilter, view_lobes
-from jaxprt.systems.lobe.table import LobeBrdf
+from jaxprt.systems.lobe.blurred_light import LobeLight, prefilter, scales
+from jaxprt.systems.lobe.pyramid import LobeTransport, between, corners
+from jaxprt.systems.lobe.table import LobeBrdf, Lobes
 from jaxprt.systems.protocol import Blend
+
+_LEAST = 1e-3  # smallest visibility by which the shift of a lobe is divided
+_FARTHEST = 2.5  # largest shift of the mean of the visible part, in standard deviations
+_TINY = 1e-12
+
+
+class LobeView(eqx.Module):
+    """A view: the texels of the blurred light that each vertex reads, and their weights.
+
+    Attributes:
+        place: Indices of texels of the blurred light, eight arrays with one texel for each lobe l.
+        visible: Weights of these texels: interpolation weight times visibility.
+        weight: Weight of each lobe, gray or per color.
+        diffuse: Albedo of the diffuse part, gray or per color.
+        vector: Transfer vectors of the vertices, for the diffuse part; no rows if the light holds the irradiance.
+        points: Points that the view belongs to; None for the vertices.
+        size: Edge of the environment's cubemap faces in texels.
+    """
+
+    place: tuple[Int[Array, "l v"], ...]
+    visible: tuple[Float[Array, "l v"], ...]
+    weight: Float[Array, "c l v"]
+    diffuse: Float[Array, "c v"]
+    vector: UInt8[Array, "h _"] | Float[Array, "h _"]
+    points: Points | None
+    size: int = eqx.field(static=True)
 
 
 class LobeSystem(protocol.VertexSystem):
     """Visibility pyramids with a BRDF as a table of lobes. Light, view and BRDF may all change without precomputation.
 
-    A `Blend` weights the channels of the BRDF table and holds the parameters of each vertex.
+    A `Blend` weights the channels of the BRDF table and holds the parameters of each vertex. Next to bright texels, hat
+    functions can make the diffuse part slightly negative. Shadows of a small sun are lost where lobes are wider than
+    the occluders; `jaxprt.bright_texels.BrightTexels` keeps them.
 
     Attributes:
         transport: Visibility pyramids, from `jaxprt.lobe.precompute`.
         brdf: The table, from `jaxprt.lobe.tabulate`.
+
+    Reference: Sun et al. 2007, section 4.1, with free lobes and the second term.
     """
 
     transport: LobeTransport
@@ -36,7 +79,7 @@ class LobeSystem(protocol.VertexSystem):
         require.kind("the BRDF", self.brdf, LobeBrdf, source="jaxprt.lobe.tabulate")
 
     def light(self, environment: Environment) -> LobeLight:
-        """The light, blurred by lobes of about a dozen widths; see `jaxprt.lobe.prefilter`."""
+        """The light, blurred by lobes of about a dozen widths."""
         return prefilter(protocol.one_light(environment, size=self.transport.size))
 
     def shade(self, light: LobeLight, materials: Blend | None = None) -> LobeLight:
@@ -56,7 +99,7 @@ class LobeSystem(protocol.VertexSystem):
         materials: Blend | None = None,
         variance: Float[Array, " v"] | None = None,
     ) -> LobeView:
-        """Texels at which each vertex reads the blurred light, with visibility; see `jaxprt.lobe.view_lobes`.
+        """Texels at which each vertex reads the blurred light, with visibility.
 
         `variance`, in squared radians, widens the lobes of each vertex or point.
         """
@@ -92,3 +135,242 @@ class LobeSystem(protocol.VertexSystem):
     def shared_light(self) -> tuple:
         """Key of the light, which depends on the environment and its size only."""
         return LobeSystem, self.transport.size
+
+
+def _brdf(value: Any) -> None:
+    require.kind("the BRDF", value, LobeBrdf, source="jaxprt.lobe.tabulate")
+
+
+@require.arguments(brdf=_brdf)
+def view_lobes(
+    transport: LobeTransport,
+    brdf: LobeBrdf,
+    *parameter: Float[Array, " v"],
+    eye: Float[Array, "*p 3"],
+    points: Points | None = None,
+    variance: Float[Array, " v"] | None = None,
+) -> LobeView:
+    """Finds the texels of the blurred light that each vertex or point reads for a view, and their visibility.
+
+    Args:
+        transport: Visibility pyramids, from `precompute`.
+        brdf: Table of lobes, from `tabulate`.
+        parameter: Values of each BRDF parameter at the vertices or points, if the table has parameters.
+        eye: Position of the viewer in world units: one, or one for each vertex or point.
+        points: Points at which radiance is evaluated; None for the vertices.
+        variance: Variance in squared radians, along one axis, by which the lobes of each vertex or point are widened;
+            None for zero.
+
+    Raises:
+        TypeError: The BRDF is not a `LobeBrdf`.
+        ValueError: The number of parameters differs from the table's, or the eye is not finite, or is neither one
+            position nor one for each vertex or point.
+    """
+    eye = require.position("the eye", eye, each=len(transport.position if points is None else points))
+    return _view_lobes(transport, brdf, parameter, eye, points, variance)
+
+
+@jit
+def _view_lobes(
+    transport: LobeTransport,
+    brdf: LobeBrdf,
+    parameter: tuple[Array, ...],
+    eye: Array,
+    points: Points | None,
+    variance: Array | None,
+) -> LobeView:
+    placing = *placed(transport.position, transport.frame, points), brdf, eye, variance
+    lobe, (face, s, t, spread) = _places(*placing, *parameter)
+    seen = transport.lobe_visibility(face, s, t, spread, points)
+    place, visible = _taps(face, s, t, spread, lobe.concentration, seen, size=transport.size)
+    return LobeView(place, visible, lobe.weight, lobe.diffuse, transport.vector, points, transport.size)
+
+
+@isolated
+def _places(
+    position: Array, frame: Array, brdf: LobeBrdf, eye: Array, variance: Array | None, *parameter: Array
+) -> tuple[Lobes, tuple[Array, ...]]:
+    """Lobes of each vertex; and cubemap face, coordinates s and t on it, and spread of each lobe."""
+    lobe = brdf.lookup(directions.view(frame, position, eye), *parameter)
+    lobe = lobe if variance is None else lobe.widened(variance)
+    world = [sum(lobe.mean[j] * frame[:, j, i] for j in range(3)) for i in range(3)]
+    return lobe, (*cubemap.project(*world), mixture.drop(lobe.concentration))
+
+
+@partial(isolated, static=("size",))
+def _taps(face, s, t, spread, concentration, visible, *, size: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Texels of the blurred light that each lobe reads, and their weights."""
+    seen, face, s, t, spread = _seen_part(visible, face, s, t, spread, concentration)
+    scale = scales(size)
+    number, upper = between(scale, spread)
+    place, result = [], []
+    for step, part in ((0, 1 - upper), (1, upper)):
+        edge, start = (jnp.asarray(x)[number + step] for x in (scale.edge, scale.start))
+        row, column, weights = corners(edge, s, t)
+        for (down, right), (value, _, _) in weights:
+            place.append(start + (face * (edge + 2) + row + down) * (edge + 2) + column + right)
+            result.append(seen * value * part)
+    return tuple(place), tuple(result)
+
+
+def _seen_part(visible, face, s, t, spread, concentration) -> tuple[Array, Array, Array, Array, Array]:
+    """Visibility of each lobe; and face, coordinates and spread of its visible part."""
+    seen, by_s, by_t = visible
+    # Derivatives on the face become a gradient on the sphere, times the variance of the lobe, 1 / (k (1 - spread)).
+    variance = (1 + s**2 + t**2) / (concentration * (1 - spread))
+    along_s = variance * (by_s * (1 + s**2) + by_t * s * t)
+    along_t = variance * (by_t * (1 + t**2) + by_s * s * t)
+    part = jnp.maximum(seen, _LEAST)
+    # Shift in standard deviations of the lobe, limited where almost nothing is visible.
+    shift = jnp.sqrt((along_s * by_s + along_t * by_t) / part**2 + _TINY)
+    reach = 1 / (part * jnp.maximum(shift / _FARTHEST, 1))
+    shift = jnp.minimum(shift, _FARTHEST)
+    # Variance across an edge at a: 1 - m (m + a) with mean m = phi(a) / Phi(a), here as a fit over m.
+    across = 1 / (1 + shift * (2 + 0.42 * shift))
+    # In the tangent plane of the lobe's direction: on the plane of the face, long steps would depend on the face.
+    by_s, by_t = along_s * reach, along_t * reach
+    inward = (s * by_s + t * by_t) / (1 + s**2 + t**2)
+    own, moved = cubemap.unproject(face, s, t), cubemap.unproject(face, s + by_s, t + by_t)
+    face, s, t = cubemap.project(*(x - inward * y for x, y in zip(moved, own, strict=True)))
+    return seen, face, s, t, spread * (1 + across) / 2
+
+
+@isolated
+def combine(light: LobeLight, view: LobeView) -> Float[Array, "v e"]:
+    """Radiance of a view under a light.
+
+    Args:
+        light: The result of `prefilter`.
+        view: The result of `view_lobes`.
+
+    Returns:
+        Linear radiance of each vertex or point, in units of the light's radiance.
+
+    Raises:
+        ValueError: The light has another size than the transport of the view.
+    """
+    if light.size != view.size:
+        raise ValueError(
+            f"the light's faces must have as many texels along an edge as the transport's, {view.size}, "
+            f"got {light.size}"
+        )
+    protocol.check_colors(len(light.pyramid), view.weight.shape[0])
+    irradiance = light.irradiance
+    if irradiance is None:
+        irradiance = diffuse.irradiance(light.coefficient, view.vector)
+    irradiance = diffuse.at_points(irradiance, light.flux, view.points)
+    # Colors are contiguous, so that one read gets all. Lobes are summed one by one, so that sums stay in the cache.
+    rows = light.pyramid.T
+
+    def lit(lobe):
+        place, visible, weight = lobe
+        taps = zip(place, visible, strict=True)
+        read = reduce(jnp.add, (rows.at[texel].get(mode="promise_in_bounds") * part[:, None] for texel, part in taps))
+        return read * weight.T
+
+    glossy = total(lit, (view.place, view.visible, jnp.swapaxes(view.weight, 0, 1)))
+    return glossy + (irradiance * view.diffuse).T
+
+
+class MatteTransport(eqx.Module):
+    """Transfer vectors of the vertices of ideally diffuse surfaces.
+
+    Attributes:
+        vector: Transfer vectors in hat functions, as bytes; see `jaxprt.systems.lobe.diffuse`.
+        position: Vertex positions in world units.
+        size: Edge of the cubemap faces in texels.
+    """
+
+    vector: UInt8[Array, "h v"]
+    position: Float[Array, "v 3"]
+    size: int = eqx.field(static=True)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the vectors."""
+        return self.vector.nbytes
+
+
+class MatteLight(eqx.Module):
+    """Light for ideally diffuse surfaces.
+
+    Attributes:
+        coefficient: Coefficients of the light; see `jaxprt.systems.lobe.diffuse`.
+        irradiance: Irradiance / pi of the vertices; None before `MatteSystem.shade`.
+        flux: Vector irradiance / pi of the vertices, for normals tilted by normal maps; None before
+            `MatteSystem.tilted`.
+    """
+
+    coefficient: Float[Array, "h c"]
+    irradiance: Float[Array, "c v"] | None = None
+    flux: Float[Array, "c 3 v"] | None = None
+
+
+class MatteSystem(protocol.VertexSystem):
+    """Transfer vectors of hat functions for ideally diffuse surfaces, whose radiance is the same for all views.
+
+    A `Blend` has one channel, the albedo of each vertex, and replaces `albedo`.
+
+    Attributes:
+        transport: Transfer vectors, from `matte_transport`.
+        albedo: Albedo of all vertices, gray or per color.
+    """
+
+    transport: MatteTransport
+    albedo: Float[Array, " c"]
+
+    def __check_init__(self):
+        """Refuses other transport, and an albedo that is negative or has neither one nor three colors."""
+        require.kind("the transport", self.transport, MatteTransport, source="jaxprt.lobe.matte_transport")
+        require.array("the albedo", self.albedo, "1", "3")
+        require.at_least("the albedo", self.albedo, 0.0)
+
+    def light(self, environment: Environment) -> MatteLight:
+        """Coefficients of the light in hat functions."""
+        light = protocol.one_light(environment, size=self.transport.size)
+        return MatteLight(diffuse.coefficients(light.radiance))
+
+    def shade(self, light: MatteLight, materials: Blend | None = None) -> MatteLight:
+        """The light with the irradiance of the vertices. Materials do not change it."""
+        require.kind("the light", light, MatteLight, source="MatteSystem.light")
+        return MatteLight(light.coefficient, diffuse.irradiance(light.coefficient, self.transport.vector))
+
+    def tilted(self, light: MatteLight, normal: Float[Array, "v 3"]) -> MatteLight:
+        """The light with vector irradiance: `System.tilted`."""
+        flux = diffuse.flux(light.coefficient, self.transport.vector, normal, size=self.transport.size)
+        return dataclasses.replace(light, flux=flux)
+
+    def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> Float[Array, "_ d"]:
+        """Albedo of all vertices, or of each vertex with a blend. It does not depend on the eye."""
+        return protocol.albedo_view(self.albedo, eye, materials, vertices=self.vertices)
+
+    @promoted
+    def combine(self, light: MatteLight, view: Float[Array, "_ d"]) -> Float[Array, "v e"]:
+        """Radiance: irradiance / pi times the albedo."""
+        require.kind("the light", light, MatteLight, source="MatteSystem.light")
+        require.array("the view", view, "v c", source="MatteSystem.view")
+        irradiance = light.irradiance
+        if irradiance is None:
+            irradiance = diffuse.irradiance(light.coefficient, self.transport.vector)
+        protocol.check_colors(len(irradiance), view.shape[1])
+        return diffuse.at_points(irradiance, light.flux, self.points).T * view
+
+    @property
+    def matte(self) -> bool:
+        """True: surfaces are ideally diffuse."""
+        return True
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices, or of points where radiance is evaluated at points."""
+        return len(self.transport.position if self.points is None else self.points)
+
+    @property
+    def shared_light(self) -> tuple:
+        """Key of the light, which depends on the environment and its size only."""
+        return MatteSystem, self.transport.size
+
+
+def matte_transport(transport: LobeTransport) -> MatteTransport:
+    """The transfer vectors of a lobe transport, without its pyramids."""
+    return MatteTransport(transport.vector, transport.position, transport.size)

@@ -4,13 +4,14 @@
 
 Here p is a von Mises-Fisher density, and d is a diffuse part. Means m, concentrations k and weights w are free and
 fitted by expectation maximization (EM). The published form, Gaussians of four fixed widths around the mirror direction,
-is `jaxprt.lobe.published.mirror_lobes`.
+stands in `benchmarks/published/lobes.py`.
 """
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,10 +21,10 @@ from jaxtyping import Array, Float
 
 from jaxprt import require
 from jaxprt.brdf import grid
-from jaxprt.compile import jit
+from jaxprt.compile import isolated, jit
 from jaxprt.decompose import mixture
 from jaxprt.sphere import harmonics, hemisphere
-from jaxprt.systems.lobe import em, knots
+from jaxprt.systems.lobe import em
 
 _STEPS = 4  # EM steps per call; every other number would be compiled separately
 # Rounds of EM: the number of calls, and the weight of neighboring nodes in the smoothing after them.
@@ -31,6 +32,7 @@ _ROUNDS = ((2, 0.5), (2, 0.5), (2, 0.25), (2, 0.25), (2, 0.1), (2, 0.1), (3, 0.0
 _DEGREE = 24  # of the natural light under which the error of a table is measured
 _COUNTS = (2, 4, 6, 8, 12, 16, 24, 32)
 _TINY = 1e-12
+WIDE, NARROW = 8.0, 32.0  # concentrations below which harmonics represent a lobe, and above which rays do
 
 
 class Lobes(eqx.Module):
@@ -156,7 +158,7 @@ class LobeBrdf(eqx.Module):
             for knot, each in zip(self.knot, parameter, strict=True)
         ]
         if place:
-            entry = knots.between(jnp.concatenate(rows), place, axis, lobes=self.lobes)
+            entry = _entries_between(jnp.concatenate(rows), place, axis, lobes=self.lobes)
             mean, scale, strength, diffuse = (jnp.moveaxis(column, 0, -1) for column in entry)
         else:
             value = grid.read(jnp.concatenate(rows), axis)
@@ -425,3 +427,81 @@ def _check(direction: Array, mass: Array, wo: np.ndarray, point: tuple) -> None:
             f"the BRDF must be finite and not negative{at}, got {len(wrong)} pairs of directions where it is not, the "
             f"first is wi = {np.asarray(direction)[view, sample]}, wo = {wo[view]}"
         )
+
+
+@jit
+def traced_share(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """Share of a lobe that is traced by rays: 0 for wide lobes, 1 for narrow ones, with a smooth step between."""
+    place = jnp.clip(jnp.log(concentration / WIDE) / math.log(NARROW / WIDE), 0, 1)
+    return place**2 * (3 - 2 * place)
+
+
+class _Entry(NamedTuple):
+    """Entries of a table of lobes, one for each view: means, logarithms of concentrations, weights, diffuse albedos."""
+
+    mean: Float[Array, "v 3 l"]
+    scale: Float[Array, "v l"]
+    weight: Float[Array, "v c l"]
+    diffuse: Float[Array, "v c"]
+
+
+def _entries_between(row: Float[Array, "r *q"], knot: list, axis: list, *, lobes: int) -> _Entry:
+    """Interpolates the rows of a table for views v with their own parameters: between knots first, then between nodes.
+
+    Args:
+        row: Means, logarithms of concentrations, weights and diffuse albedos [r] of all lobes, at all knots and nodes.
+        knot: For each parameter, the index of the lower knot and the weight of the upper one, for each view.
+        axis: For each axis of view nodes, the index of the lower node and the weight of the upper one, for each view.
+        lobes: Number of lobes.
+    """
+    sizes = row.shape[1:]
+    place, share = [], []
+    for corner in itertools.product((0, 1), repeat=len(axis)):
+        pairs = list(zip(corner, axis, strict=True))
+        share.append(math.prod((upper if up else 1 - upper for up, (_, upper) in pairs), start=jnp.ones((), row.dtype)))
+        for knots in itertools.product((0, 1), repeat=len(knot)):
+            index = jnp.zeros((), jnp.int32)
+            for up, size, (low, _) in zip((*knots, *corner), sizes, (*knot, *axis), strict=True):
+                index = index * size + low + up
+            place.append(index)
+    # All rows of a node are read at once, in a program of their own: XLA vectorizes CPU code only without gathers.
+    read = _read_rows(row.reshape(len(row), -1).T, tuple(place))
+    return _interpolate(read, tuple(upper for _, upper in knot), tuple(share), lobes=lobes)
+
+
+@partial(isolated, static=("lobes",))
+def _interpolate(read: tuple[Array, ...], upper: tuple[Array, ...], share: tuple[Array, ...], *, lobes: int) -> _Entry:
+    """Entries at all knots and nodes, interpolated: `upper` between knots, and in the given shares between nodes."""
+    entry, knots, total = [_entry(row, lobes=lobes) for row in read], 1 << len(upper), None
+    for node, part in enumerate(share):
+        at_knots = entry[node * knots : (node + 1) * knots]
+        for weight in reversed(upper):
+            pairs = zip(at_knots[::2], at_knots[1::2], strict=True)
+            at_knots = [_between_knots(low, high, weight) for low, high in pairs]
+        scaled = jax.tree.map(lambda value, part=part: value * part.reshape(-1, *[1] * (value.ndim - 1)), at_knots[0])
+        total = scaled if total is None else jax.tree.map(jnp.add, total, scaled)
+    assert total is not None
+    return total
+
+
+@isolated
+def _read_rows(row: Float[Array, "q r"], place: tuple[Array, ...]) -> tuple[Array, ...]:
+    return tuple(row.at[index].get(mode="promise_in_bounds") for index in place)
+
+
+def _entry(row: Float[Array, "v r"], *, lobes: int) -> _Entry:
+    """One entry from all its rows."""
+    colors = (row.shape[1] - 4 * lobes) // (lobes + 1)
+    mean, scale, weight, diffuse = jnp.split(row, (3 * lobes, 4 * lobes, (4 + colors) * lobes), 1)
+    return _Entry(mean.reshape(-1, 3, lobes), scale, weight.reshape(-1, colors, lobes), diffuse)
+
+
+def _between_knots(low: _Entry, high: _Entry, upper: Float[Array, " v"]) -> _Entry:
+    """Entries interpolated between two knots by the formula of `mean`."""
+    strength = [
+        jnp.maximum(share[:, None] * jnp.sum(entry.weight, 1), 0) + _TINY
+        for share, entry in ((1 - upper, low), (upper, high))
+    ]
+    strong = strength[1] / (strength[0] + strength[1])
+    weight = strong[:, None], strong, upper[:, None, None], upper[:, None]
+    return _Entry(*(a + (b - a) * part for a, b, part in zip(low, high, weight, strict=True)))

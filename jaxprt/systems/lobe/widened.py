@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 from jaxprt.compile import jit, total
 from jaxprt.sphere import cubemap, directions
 from jaxprt.systems.bright_texels import BrightLight, BrightTexels
-from jaxprt.systems.lobe.relight import LobeLight, LobeView
-from jaxprt.systems.lobe.system import LobeSystem
+from jaxprt.systems.lobe.blurred_light import LobeLight
+from jaxprt.systems.lobe.system import LobeSystem, LobeView
 from jaxprt.systems.lobe.table import Lobes
 from jaxprt.systems.protocol import Blend
 from jaxprt.visibility import LEVELS

@@ -1,6 +1,9 @@
 """The separable system: factored BRDFs, with light and transport in Haar wavelets (Wang, Tran, Luebke 2004)."""
 
-from jaxprt.systems.separable import clustered, factorization, sparse, system
+from jaxprt.systems.separable import clustered as clustered
+from jaxprt.systems.separable import factorization as factorization
+from jaxprt.systems.separable import sparse as sparse
+from jaxprt.systems.separable import system as system
 from jaxprt.systems.separable.clustered import ClusteredTransport
 from jaxprt.systems.separable.factorization import SeparableBrdf, factor, light_errors
 from jaxprt.systems.separable.sparse import SparseTransport, precompute
@@ -11,11 +14,7 @@ __all__ = [
     "SeparableBrdf",
     "SeparableSystem",
     "SparseTransport",
-    "clustered",
     "factor",
-    "factorization",
     "light_errors",
     "precompute",
-    "sparse",
-    "system",
 ]

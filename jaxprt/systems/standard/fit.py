@@ -22,6 +22,7 @@ from jaxprt.sphere import hemisphere
 from jaxprt.systems import bounces, bright_texels, harmonic, lobe
 from jaxprt.systems.bounces import traced
 from jaxprt.systems.lobe import LobeBrdf, em
+from jaxprt.systems.lobe.table import measured_error, sampled
 from jaxprt.systems.standard import descent, tables
 from jaxprt.systems.standard.families import RoughnessFamily, SheenFamily, ShininessFamily
 
@@ -119,7 +120,7 @@ def lobes(made: Material, count: int) -> dict[str, np.ndarray]:
 
 def _least(brdf: Channels, count: int) -> np.ndarray:
     """Bounds of the concentrations of lobes in EM."""
-    wo, (sample, mass, _, _) = lobe.table.sampled(brdf, resolution=32)
+    wo, (sample, mass, _, _) = sampled(brdf, resolution=32)
     return np.asarray(em.start(wo, sample, jnp.sum(mass, -1), lobes=count)[1]).T
 
 
@@ -131,7 +132,7 @@ def between(knot: np.ndarray) -> np.ndarray:
 def errors(table: LobeBrdf, family: RoughnessFamily | ShininessFamily | SheenFamily, places: np.ndarray) -> np.ndarray:
     """Error of a table at each of some roughnesses, under natural light, of the sum of all channels."""
     each = (jnp.asarray(place, table.scale.dtype) for place in places)
-    return np.array([lobe.table.measured_error(family(place), table.at(place)) for place in each])
+    return np.array([measured_error(family(place), table.at(place)) for place in each])
 
 
 def harmonics(made: Material) -> dict[str, np.ndarray]:

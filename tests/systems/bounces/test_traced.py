@@ -13,7 +13,7 @@ from jaxprt.brdf.varying import Channels
 from jaxprt.sphere import directions, harmonics
 from jaxprt.systems.bounces import traced
 from jaxprt.systems.bounces.traced import SharpPart
-from jaxprt.systems.lobe import narrow
+from jaxprt.systems.lobe import table
 
 pytestmark = pytest.mark.usefixtures("coarse")
 
@@ -66,7 +66,7 @@ def test_rays_hold_the_energy_that_is_taken_out_of_the_harmonics(roughness, clos
 def test_rays_read_smooth_light_as_the_harmonics_do(close):
     rays, weight, carried = both(0.2)
     light = np.eye(16, dtype=np.float32)[:, :9]
-    local = harmonic.local_light(part().frame, light)
+    local = harmonic.system.local_light(part().frame, light)
     expected = jnp.mean(jnp.einsum("lbv,ldv->vbd", local, carried), 0)
     read = jnp.einsum("jvd,jvb->bd", weight, harmonics.evaluate(rays.direction, degree=3) @ light) / POINTS
     # Few rays at each point, whose noise falls out over points. What of a lobe is below the horizon is turned up.
@@ -75,9 +75,9 @@ def test_rays_read_smooth_light_as_the_harmonics_do(close):
 
 def test_what_is_traced_changes_smoothly_with_the_width():
     concentration = jnp.logspace(-1, 5, 4001)
-    share = np.asarray(narrow.share(concentration))
-    assert np.all(share[concentration <= narrow.WIDE] == 0)
-    assert np.all(share[concentration >= narrow.NARROW] == 1)
+    share = np.asarray(table.traced_share(concentration))
+    assert np.all(share[concentration <= table.WIDE] == 0)
+    assert np.all(share[concentration >= table.NARROW] == 1)
     assert np.all(np.diff(share) >= 0)
     assert np.max(np.diff(share)) < 0.01
     whole = np.stack([np.asarray(both(float(r))[2])[0, :, 0] for r in np.geomspace(0.06, 0.48, 25)])

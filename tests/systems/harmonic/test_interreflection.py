@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxprt as prt
 from jaxprt import harmonic
 from jaxprt.brdf import Lambert
 from jaxprt.scene import builtin
@@ -30,6 +31,14 @@ TEXELS = 0.02
 FURNACE = 0.015  # of 167 vertices and faces of 16 x 16
 # What of a bounce's light, which one side of a vertex may see and not the other, lies above degree 4.
 CARRIED = 0.03
+
+
+def relight(transport, table, light, *, eye):
+    return prt.radiance(harmonic.HarmonicSystem(transport, table), light, eye=eye)
+
+
+def diffuse(transport, albedo, light):
+    return prt.radiance(harmonic.DiffuseSystem(transport, albedo), light, eye=jnp.zeros(3))
 
 
 def sheet(corner, first, second, cells):
@@ -163,21 +172,21 @@ def test_white_surfaces_in_a_white_furnace_vanish_as_bounces_grow():
     vector = precompute_diffuse(mesh, size=size, progress=False)
     for bounces in (0, 1, 2, 15):
         total = interreflect_diffuse(mesh, vector, np.ones((2, 1)), bounces=bounces, size=size, progress=False)
-        color = np.asarray(harmonic.diffuse_radiance(total, jnp.ones(()), WHITE))[:, 0]
+        color = np.asarray(diffuse(total, jnp.ones(1), WHITE))[:, 0]
         assert color.max() < 1 + FURNACE
         if before is not None:
             assert (color >= before - 1e-6).all()
         before = color
-    assert np.asarray(harmonic.diffuse_radiance(vector, jnp.ones(()), WHITE)).min() < 0.7
+    assert np.asarray(diffuse(vector, jnp.ones(1), WHITE)).min() < 0.7
     assert before.min() > 1 - FURNACE
 
 
 def test_a_white_furnace_is_as_white_through_matrices(mesh, matrix, vector):
     white = [tabulate(Lambert([1.0, 1, 1]), resolution=8)] * 2
     total = interreflect(mesh, matrix, white, bounces=3, size=SIZE, progress=False)
-    first, color = (np.asarray(harmonic.radiance(each, white[0], WHITE, eye=EYE))[:, 0] for each in (matrix, total))
+    first, color = (np.asarray(relight(each, white[0], WHITE, eye=EYE))[:, 0] for each in (matrix, total))
     expected = interreflect_diffuse(mesh, vector, np.ones((2, 1)), bounces=3, size=SIZE, progress=False)
-    expected = np.asarray(harmonic.diffuse_radiance(expected, jnp.ones(()), WHITE))[:, 0]
+    expected = np.asarray(diffuse(expected, jnp.ones(1), WHITE))[:, 0]
     seen = first > 0
     assert seen.sum() > 30
     assert (color[seen] >= first[seen]).all()
@@ -224,7 +233,7 @@ def test_diffuse_matrices_agree_with_vectors(mesh, matrix, vector, lambert):
     assert by_matrix.matrix.shape[1] == by_vector.vector.shape[1] == 3
     view = np.stack([np.asarray(each.coefficients(jnp.array([[0.0, 0, 1]])))[..., 0] for each in lambert])
     ours = np.einsum("vco,vcoi,ic->vc", view.swapaxes(1, 2)[np.asarray(mesh.region)], by_matrix.matrix, light)
-    expected = harmonic.diffuse_radiance(by_vector, jnp.ones(()), light) * ALBEDO[np.asarray(mesh.region)]
+    expected = diffuse(by_vector, jnp.ones(1), light) * ALBEDO[np.asarray(mesh.region)]
     assert np.linalg.norm(ours - expected) < CARRIED * np.linalg.norm(expected)
 
 

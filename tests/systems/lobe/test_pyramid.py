@@ -11,7 +11,6 @@ from jaxprt.decompose import mixture
 from jaxprt.scene import builtin
 from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.sphere import cubemap
-from jaxprt.systems.lobe import relight
 
 SIZE = 16
 BYTE = 2e-3  # half a step of a byte
@@ -205,7 +204,7 @@ def test_the_mean_of_the_seen_part_does_not_depend_on_the_face_of_the_lobe():
         tangent = slope - point * (slope @ point) / (point @ point)
         by_s, by_t = (jnp.asarray([tangent @ each / np.linalg.norm(point)]) for each in (first, second))
         visible = jnp.array([0.3]), by_s, by_t
-        seen = relight._seen_part(visible, face, s, t, mixture.drop(concentration), concentration)
+        seen = lobe.system._seen_part(visible, face, s, t, mixture.drop(concentration), concentration)
         way = np.array([float(x[0]) for x in cubemap.unproject(*seen[1:4])])
         moved.append(way / np.linalg.norm(way))
     start = np.array([0.6, 1, 1]) / np.linalg.norm([0.6, 1, 1])

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxprt as prt
 from jaxprt import bright_texels, lobe, reference, visibility
 from jaxprt.brdf import AshikhminShirley, CookTorrance
 from jaxprt.decompose import mixture
@@ -28,6 +29,10 @@ BRDFS = {
     "sharp": CookTorrance(diffuse=[0.3, 0.2, 0.1], roughness=0.1),
     "brushed": AshikhminShirley(nu=8, nv=60),
 }
+
+
+def relight(transport, table, light, *, eye):
+    return prt.radiance(lobe.LobeSystem(transport, table), light, eye=eye)
 
 
 def seen_from(depth):
@@ -72,7 +77,7 @@ def all_texels(visible, brdf, light):
 @pytest.mark.parametrize("name", BRDFS)
 def test_radiance_is_that_of_all_texels(name, visible, transport, tables, light, close):
     texel, excess, rest = bright_texels.split(light, count=8)
-    color = lobe.radiance(transport, tables[name], rest, eye=EYE)
+    color = relight(transport, tables[name], rest, eye=EYE)
     color = color + bright_texels.radiance(transport, BRDFS[name], texel, excess, eye=EYE)
     seen = facing(visible)
     close(np.asarray(color)[seen], all_texels(visible, BRDFS[name], light)[seen], tolerance=COARSE[name])
@@ -97,7 +102,7 @@ def test_light_that_grows_towards_the_open_side_counts_more():
         weight = area * np.exp(concentration * (center[:, 2] - 1))
         weight /= weight.sum()
         exact, apart = weight @ (open_side * radiance), (weight @ open_side) * (weight @ radiance)
-        value = float(lobe.radiance(half, one, light, eye=jnp.array([0.0, 0.0, 5.0]))[0, 0])
+        value = float(relight(half, one, light, eye=jnp.array([0.0, 0.0, 5.0]))[0, 0])
         assert abs(value - exact) < COVARIANCE * abs(apart - exact)
 
 
@@ -106,7 +111,7 @@ def test_a_furnace_gives_back_its_albedo(tables):
     frames = seen_from(1e4)
     open_above = lobe.compress(frames)
     white = Environment(jnp.ones((6, SIZE, SIZE, 3)))
-    color = np.asarray(lobe.radiance(open_above, tables["glossy"], white, eye=EYE))
+    color = np.asarray(relight(open_above, tables["glossy"], white, eye=EYE))
     expected = all_texels(frames, BRDFS["glossy"], white)
     seen = facing(frames) & (frames.position[:, 1] > -10)  # the ball
     np.testing.assert_allclose(color[seen], expected[seen], rtol=GRAZING)
@@ -115,7 +120,7 @@ def test_a_furnace_gives_back_its_albedo(tables):
 
 def test_blurred_light_is_the_mean_over_lobes(light):
     """Against sums over all texels, at the texel centers of each scale."""
-    filtered, scale = lobe.prefilter(light), lobe.relight.scales(SIZE)
+    filtered, scale = lobe.blurred_light.prefilter(light), lobe.blurred_light.scales(SIZE)
     center = np.asarray(cubemap.direction(size=SIZE), np.float64).reshape(-1, 3)
     area = np.asarray(cubemap.solid_angle(size=SIZE), np.float64).ravel()
     radiance = np.asarray(light.radiance, np.float64).reshape(-1, 3)
@@ -131,7 +136,7 @@ def test_blurred_light_is_the_mean_over_lobes(light):
 
 
 def test_constant_light_stays_constant_at_all_scales(close):
-    filtered = lobe.prefilter(Environment(jnp.full((6, SIZE, SIZE, 3), 2.5)))
+    filtered = lobe.blurred_light.prefilter(Environment(jnp.full((6, SIZE, SIZE, 3), 2.5)))
     close(filtered.pyramid, np.full(filtered.pyramid.shape, 2.5))
 
 
@@ -139,14 +144,14 @@ def test_a_gray_light_on_a_colored_brdf_and_the_other_way_round(transport, table
     gray = Environment(jnp.mean(light.radiance, -1, keepdims=True))
     colored = Environment(jnp.repeat(gray.radiance, 3, -1))
     for name in ("sharp", "brushed"):
-        color = lobe.radiance(transport, tables[name], gray, eye=EYE)
-        expected = lobe.radiance(transport, tables[name], colored, eye=EYE)
+        color = relight(transport, tables[name], gray, eye=EYE)
+        expected = relight(transport, tables[name], colored, eye=EYE)
         close(np.broadcast_to(color, expected.shape), expected)
 
 
 def test_a_batch_of_lights_is_refused(light, unchecked):
     with pytest.raises(ValueError, match=r"must be one environment \[6, n, n, c\].* got \[2, 6, 16, 16, 3\]"):
-        lobe.prefilter(Environment(jnp.stack([light.radiance] * 2)))
+        lobe.blurred_light.prefilter(Environment(jnp.stack([light.radiance] * 2)))
 
 
 def test_a_table_with_parameters_is_refused(transport, tables, light):
@@ -159,5 +164,5 @@ def test_a_table_with_parameters_is_refused(transport, tables, light):
         *map(jnp.asarray, (mean, scale, weight, diffuse)), (jnp.log(jnp.array([0.1, 0.3])),), tables["sharp"].error
     )
     with pytest.raises(ValueError, match=r"needs 1 parameters for each view, or `at` to choose"):
-        lobe.radiance(transport, table, light, eye=EYE)
-    assert np.isfinite(lobe.radiance(transport, table.at(jnp.asarray(-1.7)), light, eye=EYE)).all()
+        relight(transport, table, light, eye=EYE)
+    assert np.isfinite(relight(transport, table.at(jnp.asarray(-1.7)), light, eye=EYE)).all()

@@ -1,0 +1,195 @@
+"""The light blurred by lobes of about a dozen widths, for lobes of any width to read. Wider blurs have fewer texels."""
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jax.core import Tracer
+from jaxtyping import Array, Float, Int
+
+from jaxprt import require
+from jaxprt.compile import kept
+from jaxprt.decompose import mixture
+from jaxprt.scene.environment import Environment
+from jaxprt.sphere import cubemap
+from jaxprt.systems import protocol
+from jaxprt.systems.lobe import diffuse
+from jaxprt.systems.lobe.pyramid import Scales
+
+_FIRST = 0.8  # width of the finest blur, in texels of the environment
+_RATIO = 1.5  # ratio of successive widths
+_WIDEST = 1.3  # upper limit of widths, in radians
+_COARSE = 0.75  # largest edge of a texel, relative to the width
+REACH = 3.0  # radius of the blur kernel, in widths
+_BLOCK = 6 * 8**2  # directions that are projected at once
+_TILE = 4  # edge of the tiles in which blurred faces are computed, in texels
+
+
+class LobeLight(eqx.Module):
+    """A light blurred by von Mises-Fisher lobes of about a dozen widths. Wider blurs are stored at lower resolution.
+
+    Attributes:
+        pyramid: Texels of all widths, one after another, in units of radiance; each face has a border of its neighbors'
+            texels.
+        coefficient: Coefficients of the unblurred light, for the diffuse part; see `jaxprt.systems.lobe.diffuse`.
+        size: Edge of the environment's cubemap faces in texels.
+        irradiance: Irradiance / pi of the vertices; None before `LobeSystem.shade`.
+        flux: Vector irradiance / pi of the vertices, for normals that normal maps tilt; None before
+            `LobeSystem.tilted`.
+    """
+
+    pyramid: Float[Array, "c t"]
+    coefficient: Float[Array, "h c"]
+    size: int = eqx.field(static=True)
+    irradiance: Float[Array, "c v"] | None = None
+    flux: Float[Array, "c 3 v"] | None = None
+
+
+@require.arguments(light=protocol.one_light)
+def prefilter(light: Environment) -> LobeLight:
+    """Blurs a light by lobes of all widths. The result is linear in the light.
+
+    Args:
+        light: One environment.
+
+    Raises:
+        ValueError: The light is a batch, its faces have an edge of less than 8 texels, or it is not finite.
+    """
+    if light.radiance.shape[1] < 8:
+        raise ValueError(
+            f"the light must be one environment [6, n, n, c] with n of at least 8, got {list(light.radiance.shape)}"
+        )
+    pyramid = _prefilter(light, _blurs(light.radiance))
+    return LobeLight(pyramid, diffuse.coefficients(light.radiance), light.radiance.shape[1])
+
+
+@lru_cache(maxsize=8)
+def scales(size: int) -> Scales:
+    """Scales of the blurred light: the environment itself, whose faces have edge `size`, and then every width."""
+    texel = np.sqrt(4 * np.pi / 6) / size
+    width = [texel / 2]
+    while len(width) < 2 or width[-1] * _RATIO < _WIDEST:
+        width.append(_FIRST * texel * _RATIO ** (len(width) - 1))
+    edge = [size] + [_edge(each, size, least=4) for each in width[1:]]
+    edge = np.array(edge, np.int32)
+    count = 6 * (edge + 2) ** 2
+    # The mean cosine is coth k - 1/k. For sharp lobes coth k is 1 to rounding.
+    sharpness = np.array(width) ** -2
+    spread = 1 - 1 / np.tanh(np.minimum(sharpness, 50)) + 1 / sharpness
+    return Scales(edge, spread, (np.cumsum(count) - count).astype(np.int32), int(count.sum()))
+
+
+@kept
+def _prefilter(light: Environment, blurs: list[tuple[Array, Array]]) -> Float[Array, "c t"]:
+    """The light, blurred by lobes of all widths."""
+    _, size, _, colors = light.radiance.shape
+    scale = scales(size)
+    mips = {size: light.radiance}
+    edge = size
+    while edge > 4:
+        edge //= 2
+        area = cubemap.solid_angle(size=2 * edge)[..., None]
+        value, whole = (x.reshape(6, edge, 2, edge, 2, -1).sum((2, 4)) for x in (mips[2 * edge] * area, area))
+        mips[edge] = value / whole
+    levels = []
+    for number, edge in enumerate(scale.edge.tolist()):
+        value = light.radiance
+        if number:
+            index, weight = blurs[number - 1]
+            source = mips[_edge(np.sqrt(scale.spread[number]), size, least=8)].reshape(-1, colors)
+            value = weight @ source[index].reshape(*index.shape[:2], 6 * colors)
+            tile = math.isqrt(weight.shape[1])
+            value = value.reshape(edge // tile, edge // tile, tile, tile, 6, colors).transpose(4, 0, 2, 1, 3, 5)
+        levels.append(cubemap.pad(value.reshape(6, edge, edge, colors)).reshape(-1, colors).T)
+    return jnp.concatenate(levels, 1)
+
+
+def blur(edge: int, spread: float, *, size: int) -> tuple[int, float, float]:
+    """Resolution from which a blurred scale is computed, and the lobe that blurs it.
+
+    Args:
+        edge: Edge of the blurred faces in texels.
+        spread: Spread of the scale (mean of 1 - cos), from `scales`.
+        size: Edge of the light's faces in texels.
+
+    Returns:
+        Edge of the source faces in texels; spread and concentration of the blurring lobe.
+    """
+    source = _edge(np.sqrt(spread), size, least=8)
+    # Source texels (boxes) and bilinear lookup (tents) blur too; their variance is subtracted.
+    texel = np.sqrt(4 * np.pi / 6) / np.array([edge, source])
+    own = max(spread - texel[0] ** 2 / 6 - texel[1] ** 2 / 12, 0.2 * texel[1] ** 2)
+    return source, own, float(mixture.concentration_of(jnp.asarray(own)))
+
+
+def _edge(width: float, size: int, *, least: int) -> int:
+    """Edge of the coarsest faces whose texels are fine enough for a width."""
+    edge = size
+    while edge > least and np.sqrt(4 * np.pi / 6) / (edge // 2) <= _COARSE * width:
+        edge //= 2
+    return edge
+
+
+def _blurs(radiance: Float[Array | np.ndarray, "6 n n c"]) -> Sequence[tuple[Array | np.ndarray, Array | np.ndarray]]:
+    """For each width, source texels [tile, m, face] of each tile of the blurred faces, and their weights [tile, o, m].
+
+    Each tile of blurred texels o is one small dense product with its m source texels. Weights are the same on all
+    faces. They are cached on the light's device; inside a compiled program they are constants.
+    """
+    with jax.ensure_compile_time_eval():  # Traced arrays could not be cached.
+        size, dtype = radiance.shape[1], str(radiance.dtype)
+        if isinstance(radiance, np.ndarray | Tracer):
+            return _made_blurs(size, dtype)
+        return _placed_blurs(size, dtype, min(radiance.devices(), key=lambda each: each.id))
+
+
+@lru_cache(maxsize=4)
+def _placed_blurs(size: int, dtype: str, device: Any) -> list[tuple[Array, Array]]:
+    """Weights placed on a device but not committed to it, so that lights sharded over several devices can use them."""
+    with jax.default_device(device):
+        return jax.device_put(_made_blurs(size, dtype))
+
+
+@lru_cache(maxsize=4)
+def _made_blurs(size: int, dtype: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    scale = scales(size)
+    result = []
+    for edge, spread in zip(scale.edge.tolist()[1:], scale.spread.tolist()[1:], strict=True):
+        source, own, concentration = blur(edge, spread, size=size)
+        center = np.asarray(cubemap.direction(size=source), np.float64).reshape(-1, 3)
+        area = np.asarray(cubemap.solid_angle(size=source), np.float64).reshape(-1)
+        tile = min(_TILE, edge)
+        place = np.asarray(cubemap.direction(size=edge), np.float64)[0]
+        place = place.reshape(edge // tile, tile, edge // tile, tile, 3).swapaxes(1, 2).reshape(-1, tile * tile, 3)
+        reach = 2 * np.sin(min(np.pi, REACH * np.sqrt(own)) / 2)
+        near = [np.unique(np.concatenate(each)) for each in scipy.spatial.KDTree(center).query_ball_point(place, reach)]
+        index = np.zeros((len(place), max(map(len, near))), np.int32)
+        known = np.zeros(index.shape)
+        for row, each in enumerate(near):
+            index[row, : len(each)], known[row, : len(each)] = each, area[each]
+        away = 1 - np.einsum("toi,tmi->tom", place, center[index])
+        weight = known[:, None] * np.exp(-concentration * away)
+        weight /= weight.sum(-1, keepdims=True)
+        result.append((_on_faces(source)[index], np.asarray(weight, dtype)))
+    return result
+
+
+@lru_cache(maxsize=8)
+def _on_faces(size: int) -> Int[np.ndarray, "t 6"]:
+    """For each texel, the six texels at the same place relative to each of the six faces as it has to the first."""
+    place = np.asarray(cubemap.point(size=2), np.float64)
+    axes = np.stack([place[:, 0, 1] - place[:, 0, 0], place[:, 1, 0] - place[:, 0, 0], place.mean((1, 2))], 1)
+    turn = np.einsum("ji,fjk->fik", axes[0], axes)
+    moved = np.swapaxes(np.asarray(cubemap.direction(size=size)).reshape(-1, 3) @ turn, 0, 1)
+    count = len(moved)
+    padded = np.pad(moved, ((0, -(-count // _BLOCK) * _BLOCK - count), (0, 0), (0, 0)), mode="edge")
+    blocks = [cubemap.project(*np.moveaxis(each, -1, 0)) for each in padded.reshape(-1, _BLOCK, 6, 3)]
+    face, s, t = (np.concatenate([np.asarray(each) for each in rows])[:count] for rows in zip(*blocks, strict=True))
+    column, row = (np.clip((np.asarray(x) + 1) / 2 * size, 0, size - 1).astype(np.int32) for x in (s, t))
+    return np.asarray(face, np.int32) * size * size + row * size + column
