@@ -2,9 +2,9 @@
 
     python -m benchmarks.concave [--quick] [--pictures FOLDER] [--output FILE]
 
-`room` is `jaxprt.scene.interiors.room`, white walls and matte colors, under the embedded daylight. `walls` is a white
-floor beside one wall whose left half is red and whose right half is blue, under constant light. Lines are of the light
-that surfaces reflect, at pixels of one view of 128 x 128: `bounces` is what the system was made with, `depth` how many
+`room` is `benchmarks.published.interiors.room`, white walls and matte colors, under the embedded daylight. `walls` is a
+white floor beside one wall whose left half is red and whose right half is blue, under constant light. Lines are of the
+light that surfaces reflect, at pixels of one view of 128 x 128: `bounces` is what the system was made with, `depth` how many
 segments Mitsuba's paths have at most, 3 for one bounce. `error` is relative L2 of the reflected part, with Mitsuba's
 noise taken out by two pictures of unlike seeds; `brightness` is its mean over that of Mitsuba's. Lines `floor` are of
 the pixels of the white floor alone, which the wall colors.
@@ -23,6 +23,7 @@ import numpy as np
 import jaxprt as prt
 from benchmarks import harness, path_tracing
 from benchmarks.interreflection import norm, write
+from benchmarks.published import interiors
 from jaxprt import image
 from jaxprt.brdf import Lambert, MetallicRoughness
 from jaxprt.brdf.varying import PerVertex
@@ -30,7 +31,7 @@ from jaxprt.relit import reflection
 from jaxprt.relit.channels import Shading, of_part
 from jaxprt.relit.groups import Place
 from jaxprt.relit.recipes import Target
-from jaxprt.scene import Camera, Environment, Mesh, Part, TexturedMaterial, builtin, interiors
+from jaxprt.scene import Camera, Environment, Mesh, Part, TexturedMaterial, builtin
 from jaxprt.scene.mesh import make_mesh, split
 from jaxprt.systems.bounces import GroupBounces
 

@@ -19,6 +19,7 @@ import numpy as np
 from benchmarks import denoised, harness, path_tracing
 from benchmarks.pictures import BRDFS, LIGHTS, standing
 from benchmarks.pictures import view as view_of
+from benchmarks.published import interiors
 from benchmarks.scenes import averaged, finer, traced_parts
 from jaxprt import dynamic, files, image, memory, precompute, radiance, reference
 from jaxprt.brdf import CookTorrance, navigation
@@ -32,7 +33,6 @@ from jaxprt.scene import (
     Scene,
     TexturedMaterial,
     builtin,
-    interiors,
     load_environment,
     load_mesh,
 )

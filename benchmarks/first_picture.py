@@ -34,7 +34,8 @@ import numpy as np
 
 import jaxprt as prt
 from benchmarks import harness
-from jaxprt.scene import Camera, Mesh, Part, Scene, TexturedMaterial, builtin, interiors
+from benchmarks.published import interiors
+from jaxprt.scene import Camera, Mesh, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.camera import orbit
 from jaxprt.scene.mesh import join, make_mesh, split
 

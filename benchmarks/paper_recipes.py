@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import harness
-from jaxprt.scene import Mesh, builtin, interiors, load_mesh
+from benchmarks.published import interiors
+from jaxprt.scene import Mesh, builtin, load_mesh
 from jaxprt.scene.mesh import ground_plane, join, make_mesh
 from jaxprt.scene.occluder import simplify
 

@@ -5,8 +5,9 @@
     python -m benchmarks.paper_scenes --table FILE      prints the lines of a file as a table
 
 Scenes have several regions whose materials change while all of them light each other. Room, chess, walls and ring are
-made by formula (`jaxprt.scene.interiors`). The others stand in for the paper's meshes, which are not public: scans of
-JAXPRT_DATA, simplified so that each scene has the paper's number of vertices. Without the data spheres replace them.
+made by formula (`benchmarks/published/interiors.py`). The others stand in for the paper's meshes, which are not public:
+scans of JAXPRT_DATA, simplified so that each scene has the paper's number of vertices. Without the data spheres replace
+them.
 
 Lines `precompute` have the time of transport and bounces, the bytes of the bounces' tensor and of the direct light, and
 the peak of the process's memory. Where a run was stopped, a `--store` goes on from there, and the seconds of all runs

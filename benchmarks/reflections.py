@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import harness, path_tracing
+from benchmarks.published import interiors
 from benchmarks.scenes import spheres, traced_parts
 from jaxprt import RelitScene, files, image, memory, precompute
 from jaxprt.image import raster
@@ -37,7 +38,6 @@ from jaxprt.scene import (
     Scene,
     TexturedMaterial,
     builtin,
-    interiors,
     load_environment,
     load_scene,
 )

@@ -236,7 +236,7 @@ HOST = {
     "scene.light_samples": "NumPy on the host",
     "scene.builtin": "builds meshes and lights",
     "scene.shapes": "builds meshes",
-    "scene.interiors": "builds meshes",
+    "benchmarks.published.interiors": "builds meshes",
     "scene.camera.orbit": "measures a mesh on the host",
     "scene.environment.load_environment": "reads a file",
     "scene.environment.environment_from_image": "checks values",

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from benchmarks.published import interiors
 from jaxprt import visibility
-from jaxprt.scene import builtin, interiors
+from jaxprt.scene import builtin
 from jaxprt.scene.mesh import Mesh, bounds, join, split
 from jaxprt.sphere import directions
 
