@@ -31,8 +31,6 @@ PYRAMID = lobe.LobeTransport(
 )
 WANTED = {
     "jaxprt.harmonic.project": [
-        lambda: prt.radiance(SYSTEM, None, eye=EYE),
-        lambda: prt.radiance(MATTE, None, eye=EYE),
         lambda: harmonic.system.transferred_light(MATRIX, LIGHT),
         lambda: harmonic.system.local_light(MATRIX.frame, LIGHT),
         lambda: harmonic.system.combine(LIGHT, VECTOR.vector),
@@ -51,6 +49,8 @@ WANTED = {
         lambda: lobe.system.view_lobes(PYRAMID, TABLE, eye=EYE),
     ],
     "jaxprt.scene.load_environment": [
+        lambda: prt.radiance(SYSTEM, "sky", eye=EYE),
+        lambda: prt.radiance(MATTE, COEFFICIENT[:, 0], eye=EYE),
         lambda: harmonic.project(COEFFICIENT, degree=2),
         lambda: separable.system.light_tuple(SPARSE, COEFFICIENT),
         lambda: separable.system.project(COEFFICIENT),
@@ -106,7 +106,6 @@ BROKEN = jnp.ones((9, 3)).at[4, 1].set(jnp.nan)
             lambda: harmonic.system.combine(COEFFICIENT[:, 0], VECTOR.vector),
             r"\[lm, c\] or \[lm, c, v\], .* shape \[9\]",
         ),
-        (lambda: prt.radiance(SYSTEM, COEFFICIENT[:, 0], eye=EYE), r"\[lm, c\] or .* shape \[9\]"),
         (lambda: harmonic.system.local_light(MATRIX.frame, COEFFICIENT[:, 0]), r"\[lm, c\] or .* shape \[9\]"),
     ],
 )

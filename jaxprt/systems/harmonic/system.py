@@ -175,9 +175,9 @@ class DiffuseSystem(protocol.VertexSystem):
         return DiffuseSystem, self.transport.vector.shape[0]
 
 
-def _coefficients(light: Environment | Array, degree: int) -> Float[Array, "lm c *w"]:
+def _coefficients(light: Any, degree: int) -> Float[Array, "lm c *w"]:
     """SH coefficients of one light, which may be given as such."""
-    if isinstance(light, Environment):
+    if isinstance(light, Environment) or jnp.ndim(light) not in (2, 3):
         return project(protocol.one_light(light), degree=degree)
     light = _light(light)
     if harmonics.degree_of(light.shape[0]) != degree:
