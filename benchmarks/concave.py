@@ -2,12 +2,12 @@
 
     python -m benchmarks.concave [--quick] [--pictures FOLDER] [--output FILE]
 
-`room` is `benchmarks.published.interiors.room`, white walls and matte colors, under the embedded daylight. `walls` is a
-white floor beside one wall whose left half is red and whose right half is blue, under constant light. Lines are of the
-light that surfaces reflect, at pixels of one view of 128 x 128: `bounces` is what the system was made with, `depth` how many
-segments Mitsuba's paths have at most, 3 for one bounce. `error` is relative L2 of the reflected part, with Mitsuba's
-noise taken out by two pictures of unlike seeds; `brightness` is its mean over that of Mitsuba's. Lines `floor` are of
-the pixels of the white floor alone, which the wall colors.
+`room` is `benchmarks.published.interiors.room`, white walls and matte colors, under the embedded daylight. `walls` is
+a white floor beside one wall whose left half is red and whose right half is blue, under constant light. Lines are of
+the light that surfaces reflect, at pixels of one view of 128 x 128: `bounces` is what the system was made with,
+`depth` how many segments Mitsuba's paths have at most, 3 for one bounce. `error` is relative L2 of the reflected
+part, with Mitsuba's noise taken out by two pictures of unlike seeds; `brightness` is its mean over that of Mitsuba's.
+Lines `floor` are of the pixels of the white floor alone, which the wall colors.
 """
 
 import pathlib

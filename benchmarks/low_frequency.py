@@ -13,13 +13,10 @@ import numpy as np
 
 from benchmarks import harness
 from jaxprt import scene
-from jaxprt.brdf import AshikhminShirley
 from jaxprt.scene import Environment, builtin, load_environment
 from jaxprt.sphere import cubemap, harmonics, products
 
 LIGHTS = {"grace": "grace_cross.hdr", "eucalyptus": "eucalyptus_rnl_cross.hdr", "sunrise": "polyhaven_sunrise_1k.exr"}
-BRDF = AshikhminShirley(nu=48, nv=16)
-MOST = 2e9  # bytes of uncompressed matrices that are measured
 
 
 def main(options: Sequence[str] | None = None) -> None:

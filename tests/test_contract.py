@@ -19,6 +19,7 @@ import functools
 import importlib
 import inspect
 import pkgutil
+import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -985,9 +986,7 @@ OF_ROUNDING = ["decompose.eigen.symmetric", "decompose.eigen.power", "decompose.
 # The harmonic system has lights of another kind. Jitted functions know no values; their lights were checked before.
 RELIGHTING = re.compile(r"systems\..*\.(relight|system|blurred_light)\.")
 LIT = [
-    name
-    for name in PURE
-    if RELIGHTING.match(name) and "harmonic" not in name and not isinstance(PUBLIC[name], JITTED)
+    name for name in PURE if RELIGHTING.match(name) and "harmonic" not in name and not isinstance(PUBLIC[name], JITTED)
 ]
 
 
