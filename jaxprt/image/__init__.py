@@ -2,7 +2,9 @@
 
 from jaxprt.image.metrics import flip, psnr, relative_l2
 from jaxprt.image.pixels import Pixels, interpolate, render, resolve, shading_points
-from jaxprt.image.raster import Fragments, front, rasterize, ray_direction
+from jaxprt.image.raster import Fragments, rasterize
+from jaxprt.image.raster import front as front
+from jaxprt.image.raster import ray_direction as ray_direction
 from jaxprt.image.skies import sky
 from jaxprt.image.tonemap import automatic_exposure, decode_srgb, display, encode_srgb, expose
 
@@ -15,11 +17,9 @@ __all__ = [
     "encode_srgb",
     "expose",
     "flip",
-    "front",
     "interpolate",
     "psnr",
     "rasterize",
-    "ray_direction",
     "relative_l2",
     "render",
     "resolve",

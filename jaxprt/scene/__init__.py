@@ -1,18 +1,12 @@
 """Scenes: meshes, materials, environments, cameras, file formats, and embedded examples."""
 
-from jaxprt.scene import (
-    builtin,
-    camera,
-    environment,
-    light_probes,
-    light_samples,
-    material,
-    mesh,
-    occluder,
-    subdivision,
-    suns,
-    texture,
-)
+from jaxprt.scene import builtin, camera, environment, mesh, occluder
+from jaxprt.scene import light_probes as light_probes
+from jaxprt.scene import light_samples as light_samples
+from jaxprt.scene import material as material
+from jaxprt.scene import subdivision as subdivision
+from jaxprt.scene import suns as suns
+from jaxprt.scene import texture as texture
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Environment, load_environment
 from jaxprt.scene.formats.scene_file import load_mesh, load_scene
@@ -37,16 +31,10 @@ __all__ = [
     "environment",
     "irradiance",
     "light_probe",
-    "light_probes",
-    "light_samples",
     "load_environment",
     "load_mesh",
     "load_scene",
-    "material",
     "mesh",
     "occluder",
-    "subdivision",
-    "suns",
-    "texture",
     "with_suns",
 ]

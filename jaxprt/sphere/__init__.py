@@ -1,25 +1,14 @@
 """Functions on the sphere and hemisphere: directions, hemisphere maps, cubemaps, wavelets, spherical harmonics."""
 
-from jaxprt.sphere import (
-    conventions,
-    cubemap,
-    directions,
-    haar,
-    harmonics,
-    hats,
-    hemisphere,
-    lighting,
-    products,
-    rotation,
-)
+from jaxprt.sphere import conventions as conventions
+from jaxprt.sphere import cubemap, directions, haar, harmonics, hemisphere, lighting, products, rotation
+from jaxprt.sphere import hats as hats
 
 __all__ = [
-    "conventions",
     "cubemap",
     "directions",
     "haar",
     "harmonics",
-    "hats",
     "hemisphere",
     "lighting",
     "products",
