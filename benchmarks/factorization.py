@@ -18,11 +18,11 @@ import numpy as np
 import scipy.sparse.linalg
 
 from benchmarks import harness
+from benchmarks.published import maps
 from benchmarks.published.factorization import brown_plastic, factor_symmetric, red_plastic, sample_error
 from jaxprt import separable
 from jaxprt.brdf import AshikhminShirley, load_lafortune
 from jaxprt.decompose import eigen
-from jaxprt.sphere import hemisphere
 
 TERMS = (4, 8, 16, 32, 64)
 QUICK = (8,)
@@ -47,8 +47,8 @@ def main(options: Sequence[str] | None = None) -> None:
 
 def brdf_matrix(resolution: int) -> jax.Array:
     """The published BRDF at all pairs of texels inside the disk."""
-    direction = hemisphere.texel_direction(resolution=resolution).reshape(-1, 3)
-    inside = np.flatnonzero(hemisphere.texel_area(resolution=resolution).ravel())
+    direction = maps.texel_direction(resolution=resolution).reshape(-1, 3)
+    inside = np.flatnonzero(maps.texel_area(resolution=resolution).ravel())
     return separable.factorization.tabulate(AshikhminShirley(), direction[inside])[0]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks import harness
 from jaxprt import scene
 from jaxprt.scene import Environment, builtin, load_environment
-from jaxprt.sphere import cubemap, harmonics, products
+from jaxprt.sphere import cubemap, harmonics, low_frequency
 
 LIGHTS = {"grace": "grace_cross.hdr", "eucalyptus": "eucalyptus_rnl_cross.hdr", "sunrise": "polyhaven_sunrise_1k.exr"}
 
@@ -65,13 +65,13 @@ def multiplication(quick: bool, degree: int = 4) -> dict:
     pairs, terms = (100 if quick else 100_000), (degree + 1) ** 2
     random = np.random.default_rng(3)
     first, second = (jnp.asarray(random.normal(size=(terms, pairs)), jnp.float32) for _ in range(2))
-    node, weight = products.quadrature(3 * degree)
+    node, weight = harmonics.quadrature(3 * degree)
     basis = harmonics.basis(np, node, degree)
     gamma = np.einsum("iq,jq,kq,q->ijk", basis, basis, basis, weight)
     nonzero = np.argwhere(np.abs(gamma) > 1e-12)
     order = nonzero[np.argsort(nonzero[:, 2], kind="stable")]
     value = jnp.asarray(gamma[tuple(order.T)], jnp.float32)
-    own = jax.jit(lambda a, b: products.product(a, b, degree=degree))
+    own = jax.jit(lambda a, b: low_frequency.product(a, b, degree=degree))
     sparse = jax.jit(
         lambda a, b: jax.ops.segment_sum(
             value[:, None] * a[order[:, 0]] * b[order[:, 1]], order[:, 2], terms, indices_are_sorted=True

@@ -30,13 +30,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import compression, harness
+from benchmarks.published import maps
 from benchmarks.published.lobes import mirror_lobes
 from jaxprt import bright_texels, dynamic, reference, separable, visibility
 from jaxprt.brdf import CookTorrance, Lambert, navigation
 from jaxprt.image import interpolate, raster
 from jaxprt.scene import Environment, Mesh, builtin, camera, environment, load_mesh
 from jaxprt.scene.mesh import ground_plane, join
-from jaxprt.sphere import hemisphere
 
 ROUGHNESS = (0.2, 0.05, 0.35, 0.1, 0.5)  # in turn; a quick run has the first three
 LOBES = (4, 8)
@@ -279,8 +279,8 @@ def figure_5(quick: bool):
 def principal(brdfs, *, functions: int) -> dict:
     """What some functions leave of a set, in the norm of the disk and of BRDFs of equal norm."""
     start = time.perf_counter()
-    direction = hemisphere.texel_direction(resolution=24).reshape(-1, 3)
-    area = jnp.sqrt(hemisphere.texel_area(resolution=24).ravel())
+    direction = maps.texel_direction(resolution=24).reshape(-1, 3)
+    area = jnp.sqrt(maps.texel_area(resolution=24).ravel())
     rows = np.stack(
         [np.ravel(separable.factorization.tabulate(each, direction) * area * area[:, None]) for each in brdfs]
     )

@@ -27,11 +27,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import harness
+from benchmarks.published import maps
 from benchmarks.published.tensors import hooi
 from jaxprt.brdf import BlinnPhong, CookTorrance
 from jaxprt.decompose import tucker
 from jaxprt.decompose.tucker import Tucker
-from jaxprt.sphere import hemisphere
 
 RANKS = (4, 8, 8)
 SWEEPS = 2
@@ -86,8 +86,8 @@ def against(name: str, tensor: jax.Array, start: str, sweeps: int, repeats: int)
 
 def alone(name: str) -> dict:
     """The line of one method on the larger table; for a process of its own."""
-    direction = hemisphere.texel_direction(resolution=RESOLUTION).reshape(-1, 3)
-    direction = direction[np.flatnonzero(hemisphere.texel_area(resolution=RESOLUTION).ravel())]
+    direction = maps.texel_direction(resolution=RESOLUTION).reshape(-1, 3)
+    direction = direction[np.flatnonzero(maps.texel_area(resolution=RESOLUTION).ravel())]
     brdf = jax.vmap(lambda n: BlinnPhong(diffuse=0.0, specular=1.0, exponent=n))(1.0 + jnp.arange(EXPONENTS))
     tensor = jax.block_until_ready(tabulate(brdf, direction, jnp.ones(len(direction))))
     built = harness.peak_memory()
@@ -105,8 +105,8 @@ def cook_torrance(quick: bool) -> jax.Array:
         random = np.random.default_rng(0).uniform(size=(2, 10 if quick else 86)).astype(np.float32)
         roughness, f0 = 0.01 * 50 ** random[0], random[1]
     resolution = 8 if quick else 32
-    direction = hemisphere.texel_direction(resolution=resolution).reshape(-1, 3)
-    weight = jnp.sqrt(hemisphere.texel_area(resolution=resolution).ravel())
+    direction = maps.texel_direction(resolution=resolution).reshape(-1, 3)
+    weight = jnp.sqrt(maps.texel_area(resolution=resolution).ravel())
     brdf = jax.vmap(lambda m, f: CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=f))(roughness, f0)
     return tabulate(brdf, direction, weight)
 

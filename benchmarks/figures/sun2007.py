@@ -15,13 +15,13 @@ import numpy as np
 from benchmarks import harness
 from benchmarks.figures import drawing
 from benchmarks.figures.run import Clock, Run
+from benchmarks.published import maps
 from benchmarks.published.lobes import mirror_lobes
 from benchmarks.published.tensors import hooi
 from jaxprt import dynamic, image
 from jaxprt.brdf import navigation
 from jaxprt.decompose import tucker
 from jaxprt.scene import builtin, camera
-from jaxprt.sphere import hemisphere
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.separable.factorization import tabulate
 
@@ -77,8 +77,8 @@ def sharpest(brdfs: Sequence, resolution: int, terms: int) -> dict[str, float]:
     table, whole = samples([brdf], None, resolution=resolution)
     matrix = np.asarray(table[0], np.float64)
     square = np.linalg.svd(matrix, compute_uv=False)[:terms] ** 2
-    direction = hemisphere.texel_direction(resolution=resolution).reshape(-1, 3)
-    inside = np.flatnonzero(np.asarray(hemisphere.texel_area(resolution=resolution)).ravel())
+    direction = maps.texel_direction(resolution=resolution).reshape(-1, 3)
+    inside = np.flatnonzero(np.asarray(maps.texel_area(resolution=resolution)).ravel())
     grazing = np.asarray(direction)[inside, 2] < np.cos(np.radians(70))
     return {
         "terms": terms,
@@ -105,8 +105,8 @@ def samples(brdfs: Sequence, table: LobeBrdf | None, *, resolution: int) -> tupl
 
     The lobes of the table are narrower than texels. So they are fitted anew to the samples, see `sampled_lobes`.
     """
-    direction = hemisphere.texel_direction(resolution=resolution).reshape(-1, 3)
-    inside = np.flatnonzero(np.asarray(hemisphere.texel_area(resolution=resolution)).ravel())
+    direction = maps.texel_direction(resolution=resolution).reshape(-1, 3)
+    inside = np.flatnonzero(np.asarray(maps.texel_area(resolution=resolution)).ravel())
     direction = direction[inside]
     tensor = jnp.asarray(np.stack([np.asarray(tabulate(brdf, direction)[0]) for brdf in brdfs]))
     whole = squared_norm(tensor)

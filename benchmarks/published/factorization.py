@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from benchmarks.published import maps
 from jaxprt.brdf import models
 from jaxprt.compile import jit
 from jaxprt.decompose import eigen
@@ -22,8 +23,8 @@ from jaxprt.systems.separable.factorization import SeparableBrdf, tabulate
 
 _RECIPROCAL = 1e-3  # largest relative asymmetry of M at which its eigenvectors count as singular vectors
 _TEXELS: dict[Callable, tuple[Callable, Callable]] = {
-    hemisphere.disk_coordinates: (hemisphere.texel_direction, hemisphere.texel_area),
-    hemisphere.polar_coordinates: (hemisphere.polar_texel_direction, hemisphere.polar_texel_area),
+    hemisphere.disk_coordinates: (maps.texel_direction, maps.texel_area),
+    hemisphere.polar_coordinates: (maps.polar_texel_direction, maps.polar_texel_area),
 }
 
 

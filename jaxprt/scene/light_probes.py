@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from jaxprt import require
 from jaxprt.scene.environment import Environment
-from jaxprt.sphere import harmonics, lighting
+from jaxprt.sphere import harmonics, low_frequency
 
 _DEGREE = 2
 _COSINE = (1.0, 2 / 3, 1 / 4)  # factor of a clamped cosine over pi on each band: Ramamoorthi and Hanrahan 2001
@@ -89,4 +89,4 @@ def irradiance(environment: Environment, normal: ArrayLike, *, degree: int = 8) 
         raise ValueError(f"normals must be [.., 3], got {list(np.shape(normal))}")
     require.finite("normals", normal)
     coefficient = harmonics.project(environment.radiance, degree=degree)
-    return lighting.irradiance(coefficient, jnp.asarray(normal, coefficient.dtype))
+    return low_frequency.irradiance(coefficient, jnp.asarray(normal, coefficient.dtype))

@@ -1,7 +1,6 @@
 """Functions on the sphere and hemisphere: directions, hemisphere maps, cubemaps, wavelets, spherical harmonics."""
 
-from jaxprt.sphere import conventions as conventions
-from jaxprt.sphere import cubemap, directions, haar, harmonics, hemisphere, lighting, products, rotation
+from jaxprt.sphere import cubemap, directions, haar, harmonics, hemisphere, low_frequency, rotation
 from jaxprt.sphere import hats as hats
 
 __all__ = [
@@ -10,7 +9,6 @@ __all__ = [
     "haar",
     "harmonics",
     "hemisphere",
-    "lighting",
-    "products",
+    "low_frequency",
     "rotation",
 ]

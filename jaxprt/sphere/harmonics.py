@@ -252,6 +252,25 @@ def _three_faces(s: np.ndarray, t: np.ndarray) -> np.ndarray:
     return np.concatenate([np.roll(local, turn, axis=-1) for turn in range(3)])
 
 
+@functools.lru_cache(maxsize=8)
+def quadrature(degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """Quadrature on the sphere that integrates all spherical harmonics up to a degree exactly.
+
+    It has Gauss points in z and equal steps of azimuth.
+
+    Args:
+        degree: Highest degree l of the integrand. For a product, it is the sum of the factors' degrees.
+
+    Returns:
+        Unit directions [q, 3] and weights [q], which sum to 4 pi, in float64.
+    """
+    height, weight = np.polynomial.legendre.leggauss(degree // 2 + 1)
+    angle = 2 * np.pi * np.arange(degree + 1) / (degree + 1)
+    radius = np.sqrt(1 - height**2)[:, None]
+    node = np.stack([radius * np.cos(angle), radius * np.sin(angle), height[:, None] + 0 * angle], -1)
+    return node.reshape(-1, 3), np.repeat(weight * 2 * np.pi / (degree + 1), degree + 1)
+
+
 @jit
 def convolve(coefficient: Float[Array, "lm *c"], factor: Float[Array, " l"]) -> Float[Array, "lm *c"]:
     """Multiplies every band by the factor of a zonal kernel or a window.

@@ -117,42 +117,6 @@ def matrix(rotation: Float[Array, "3 3"], *, degree: int) -> Float[Array, "lm lm
     return rotate(jnp.eye((degree + 1) ** 2, dtype=rotation.dtype), rotation)
 
 
-@functools.partial(jit, static_argnames="degree")
-def low_matrix(rotation: Float[Array, "*b 3 3"], *, degree: int) -> Float[Array, "*b lm lm"]:
-    """Rotation matrix D(R) of SH coefficients for degrees up to 2, as polynomials in the entries of R.
-
-    The block of band 1 is R with its axes in the order y, z, x. A function of band 2 is s^T Q s with a symmetric,
-    trace-free matrix Q, so the entries of its block are sums of products of two entries of R. Derivatives are those of
-    the polynomials.
-
-    Args:
-        rotation: Matrices of rotations or reflections.
-        degree: Highest degree l of the harmonics, 0 to 2.
-
-    Raises:
-        ValueError: The degree is negative or above 2.
-
-    Reference: Kautz, Sloan, Snyder 2002, appendix, first method.
-    """
-    if not 0 <= degree <= 2:
-        raise ValueError(f"degree must be 0, 1 or 2, got {degree}; for more use matrix")
-    result = jnp.zeros((*rotation.shape[:-2], 9, 9), rotation.dtype).at[..., 0, 0].set(1)
-    axis = np.array([1, 2, 0])
-    result = result.at[..., 1:4, 1:4].set(rotation[..., axis[:, None], axis])
-    form = jnp.asarray(_QUADRATIC, rotation.dtype)
-    turned = jnp.einsum("...ji,mjk,...kl->...mil", rotation, form, rotation, precision="highest")
-    result = result.at[..., 4:, 4:].set(jnp.einsum("...mil,nil->...mn", turned, form, precision="highest"))
-    return result[..., : (degree + 1) ** 2, : (degree + 1) ** 2]
-
-
-# Basis functions of band 2 as quadratic forms of unit norm: x y, y z, 3 z^2 - 1, x z, x^2 - y^2.
-_QUADRATIC = np.zeros((5, 3, 3))
-for _row, (_i, _j) in ((0, (0, 1)), (1, (1, 2)), (3, (0, 2))):
-    _QUADRATIC[_row, _i, _j] = _QUADRATIC[_row, _j, _i] = math.sqrt(1 / 2)
-_QUADRATIC[2] = np.diag([-1, -1, 2]) / math.sqrt(6)
-_QUADRATIC[4] = np.diag([1, -1, 0]) / math.sqrt(2)
-
-
 @functools.partial(jax.custom_jvp)
 def _rotated(coefficient: Array, rotation: Array) -> Array:
     """Rotates coefficients [lm, *c] by rotations [3, 3, *v], where *v broadcasts against the last axes of *c."""

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.published import maps
 from benchmarks.published.factorization import (
     brown_plastic,
     factor_normalized,
@@ -18,8 +19,8 @@ from jaxprt.sphere import hemisphere
 
 WANG = AshikhminShirley(diffuse=0.5, specular=0.75, nu=10, nv=100)
 MAPS = {
-    "disk": (hemisphere.disk_coordinates, hemisphere.texel_direction, hemisphere.texel_area),
-    "polar": (hemisphere.polar_coordinates, hemisphere.polar_texel_direction, hemisphere.polar_texel_area),
+    "disk": (hemisphere.disk_coordinates, maps.texel_direction, maps.texel_area),
+    "polar": (hemisphere.polar_coordinates, maps.polar_texel_direction, maps.polar_texel_area),
 }
 each_map = pytest.mark.parametrize("name", MAPS)
 
@@ -76,7 +77,7 @@ def test_error_is_the_optimum_of_its_rank(name):
 def test_published_spectrum_of_the_published_brdf():
     factored = factor_symmetric(WANG, terms=16)
     # |light map inside the disk|^2 is the eigenvalue's magnitude.
-    area = hemisphere.texel_area(resolution=48)
+    area = maps.texel_area(resolution=48)
     light, view = (np.asarray(each)[..., 0] for each in (factored.light_map, factored.view_map))
     value = np.sum(np.where(np.asarray(area) > 0, light**2, 0), (1, 2))
     sign = np.sign(np.sum(light * view, (1, 2)))

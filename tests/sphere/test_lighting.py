@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxprt.scene import Environment, irradiance, load_environment
-from jaxprt.sphere import cubemap, harmonics, lighting
+from jaxprt.sphere import cubemap, harmonics, low_frequency
 
 RNG = np.random.default_rng(4)
 # Grace Cathedral's coefficients as Ramamoorthi and Hanrahan published them with their 2001 paper:
@@ -57,7 +57,7 @@ def published(sh, normal):
 
 def test_nine_coefficients_give_the_published_quadratic_form(close):
     normal = unit(30)
-    found = lighting.irradiance(jnp.asarray(GRACE, jnp.float32), jnp.asarray(normal, jnp.float32))
+    found = low_frequency.irradiance(jnp.asarray(GRACE, jnp.float32), jnp.asarray(normal, jnp.float32))
     close(found, published(GRACE, normal), tolerance=5e-6)  # Its constants have six digits.
 
 
@@ -106,11 +106,11 @@ def test_lights_that_are_no_lights_are_refused():
 def test_a_directional_light_is_found_again(degree, x64, close):
     way, color = unit(1)[0], np.array([3.0, 2.0, 0.5])
     sharp = np.asarray(harmonics.evaluate(jnp.asarray(way), degree=degree))[:, None] * color
-    direction, found = lighting.directional_light(jnp.asarray(sharp))
+    direction, found = low_frequency.directional_light(jnp.asarray(sharp))
     close(direction, way)
     close(found, color)
     sharp[0] += np.sqrt(4 * np.pi) * 0.7  # and with constant light of 0.7
-    direction, found, ambient = lighting.directional_and_ambient(jnp.asarray(sharp))
+    direction, found, ambient = low_frequency.directional_and_ambient(jnp.asarray(sharp))
     close(direction, way)
     close(found, color)
     close(ambient, np.full(3, 0.7))
@@ -118,10 +118,10 @@ def test_a_directional_light_is_found_again(degree, x64, close):
 
 def test_colors_are_those_of_least_squares(x64, close):
     light = RNG.normal(size=(16, 3)) + 2 * (np.arange(16) == 0)[:, None]
-    direction, color = lighting.directional_light(jnp.asarray(light))
+    direction, color = low_frequency.directional_light(jnp.asarray(light))
     basis = np.asarray(harmonics.evaluate(direction, degree=3))
     close(color, np.linalg.lstsq(basis[:, None], light, rcond=None)[0][0])
-    direction, color, ambient = lighting.directional_and_ambient(jnp.asarray(light))
+    direction, color, ambient = low_frequency.directional_and_ambient(jnp.asarray(light))
     constant = np.sqrt(4 * np.pi) * (np.arange(16) == 0)
     close(np.stack([color, ambient]), np.linalg.lstsq(np.stack([basis, constant], 1), light, rcond=None)[0])
 
@@ -130,32 +130,32 @@ def test_sloans_normalization_of_nine_coefficients(x64, close):
     """A white surface that faces the light has radiance 1 where the light's coefficients are 16 pi / 17 y_i(d)."""
     way = jnp.asarray(unit(1)[0])
     light = harmonics.evaluate(way, degree=2)[:, None] * (16 * np.pi / 17)
-    close(lighting.irradiance(light, way) / np.pi, np.ones(1))
-    close(lighting.directional_light(light)[1], np.full(1, 16 * np.pi / 17))
+    close(low_frequency.irradiance(light, way) / np.pi, np.ones(1))
+    close(low_frequency.directional_light(light)[1], np.full(1, 16 * np.pi / 17))
 
 
 def test_the_direction_is_where_the_sun_is(close):
     way = unit(1)[0]
     sun = harmonics.disc(jnp.asarray(way, jnp.float32), jnp.asarray(0.3, jnp.float32), degree=4)
-    close(lighting.dominant_direction(sun[:, None] * jnp.array([0.1, 1.0, 2.0])), way, tolerance=1e-5)
+    close(low_frequency.dominant_direction(sun[:, None] * jnp.array([0.1, 1.0, 2.0])), way, tolerance=1e-5)
     blue, red = np.zeros((4, 3)), np.zeros((4, 3))
     red[3, 0], blue[1, 2] = 1.0, 1.0
-    seen = np.asarray(lighting.dominant_direction(jnp.asarray(red + blue, jnp.float32)))
+    seen = np.asarray(low_frequency.dominant_direction(jnp.asarray(red + blue, jnp.float32)))
     np.testing.assert_allclose(seen, np.array([0.2126, 0.0722, 0]) / np.hypot(0.2126, 0.0722), rtol=1e-5)
-    tiny = lighting.dominant_direction(jnp.asarray((red + blue) * 1e-30, jnp.float32))  # squares underflow
+    tiny = low_frequency.dominant_direction(jnp.asarray((red + blue) * 1e-30, jnp.float32))  # squares underflow
     np.testing.assert_allclose(tiny, seen, rtol=1e-5)
 
 
 def test_light_without_direction_has_none_and_finite_gradients():
     for light, mean in ((np.zeros((9, 3)), 0.0), (np.eye(9)[:, :1] * np.sqrt(4 * np.pi) * np.ones(3), 1.0)):
         coefficient = jnp.asarray(light, jnp.float32)
-        direction, color, ambient = lighting.directional_and_ambient(coefficient)
+        direction, color, ambient = low_frequency.directional_and_ambient(coefficient)
         assert not np.any(direction)
         assert not np.any(color)
-        assert not np.any(lighting.directional_light(coefficient)[1])
+        assert not np.any(low_frequency.directional_light(coefficient)[1])
         np.testing.assert_allclose(ambient, np.full(3, mean), rtol=1e-6)
-        slope = jax.jacobian(lighting.directional_and_ambient)(coefficient)
+        slope = jax.jacobian(low_frequency.directional_and_ambient)(coefficient)
         assert all(np.isfinite(each).all() for each in slope)
         assert not np.any(slope[0])
     with pytest.raises(ValueError, match="degree 1 or more to have a direction, got degree 0"):
-        lighting.dominant_direction(jnp.ones((1, 3)))
+        low_frequency.dominant_direction(jnp.ones((1, 3)))

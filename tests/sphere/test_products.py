@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import sph_harm_y
 
-from jaxprt.sphere import harmonics, products
+from jaxprt.sphere import harmonics, low_frequency
 from jaxprt.systems.harmonic import transfer
 
 RNG = np.random.default_rng(2)
@@ -37,9 +37,9 @@ def test_products_are_projections_of_the_product_of_values(x64, close):
     value = (scipy_basis(node, 4) @ first) * (scipy_basis(node, 3) @ second)
     for degree in (0, 4, 7):
         expected = scipy_basis(node, degree).T @ (weight[:, None] * value)
-        close(products.product(jnp.asarray(first), jnp.asarray(second), degree=degree), expected)
+        close(low_frequency.product(jnp.asarray(first), jnp.asarray(second), degree=degree), expected)
     # Degree 7 holds all of it, so that values multiply.
-    whole = products.product(jnp.asarray(first), jnp.asarray(second), degree=7)
+    whole = low_frequency.product(jnp.asarray(first), jnp.asarray(second), degree=7)
     close(scipy_basis(node, 7) @ np.asarray(whole), value)
 
 
@@ -53,7 +53,7 @@ def test_integrals_of_three_basis_functions_are_e3nns_coefficients_up_to_one_fac
             shape[axis] = 2 * l + 1
             own = np.eye((l + 1) ** 2)[:, l * l :].reshape(-1, *shape)
             part.append(jnp.asarray(np.broadcast_to(own, (len(own), *sizes))))
-        found = products.triple(*part)
+        found = low_frequency.triple(*part)
         theirs = np.asarray(e3nn.clebsch_gordan(*bands))
         factor = np.vdot(np.asarray(found), theirs) / np.vdot(theirs, theirs)
         assert abs(factor) > 0.01
@@ -63,46 +63,46 @@ def test_integrals_of_three_basis_functions_are_e3nns_coefficients_up_to_one_fac
 
 def test_an_operator_multiplies_and_is_symmetric(x64, close):
     first, second = jnp.asarray(RNG.normal(size=(49, 2))), jnp.asarray(RNG.normal(size=16))
-    matrix = products.operator(first, degree=3)
+    matrix = low_frequency.operator(first, degree=3)
     assert matrix.shape == (16, 16, 2)
-    close(jnp.einsum("kjc,j->kc", matrix, second), products.product(first, second[:, None], degree=3))
+    close(jnp.einsum("kjc,j->kc", matrix, second), low_frequency.product(first, second[:, None], degree=3))
     close(matrix, matrix.swapaxes(0, 1))
-    close(products.operator(jnp.zeros(1).at[0].set(np.sqrt(4 * np.pi)), degree=3), np.eye(16))
+    close(low_frequency.operator(jnp.zeros(1).at[0].set(np.sqrt(4 * np.pi)), degree=3), np.eye(16))
 
 
 def test_the_operator_of_visibility_is_the_transfer_matrix_in_the_world(close):
     visible = jnp.asarray(RNG.normal(size=(25, 2)), jnp.float32)
     frame = jnp.broadcast_to(jnp.eye(3), (2, 3, 3))
     matrix = transfer.from_visibility(visible, frame, degree=2)
-    close(jnp.moveaxis(products.operator(visible, degree=2), -1, 0), matrix, tolerance=1e-5)
+    close(jnp.moveaxis(low_frequency.operator(visible, degree=2), -1, 0), matrix, tolerance=1e-5)
 
 
 def test_triple_integrals_are_symmetric_and_differentiable(x64, close):
     node, weight = dense_rule()
     parts = [jnp.asarray(RNG.normal(size=n)) for n in (9, 16, 25)]
     values = [scipy_basis(node, d) @ np.asarray(p) for d, p in zip((2, 3, 4), parts, strict=True)]
-    close(products.triple(*parts), np.sum(weight * np.prod(values, 0)))
-    close(products.triple(*parts), products.triple(*parts[::-1]))
-    slope = jax.grad(products.triple)(*parts)
+    close(low_frequency.triple(*parts), np.sum(weight * np.prod(values, 0)))
+    close(low_frequency.triple(*parts), low_frequency.triple(*parts[::-1]))
+    slope = jax.grad(low_frequency.triple)(*parts)
     close(slope, scipy_basis(node, 2).T @ (weight * values[1] * values[2]))
 
 
 def test_products_cost_little_more_than_they_must():
     """Three small products for each: within the operations of the dense sums over Gamma, at degree 4."""
-    call = jax.jit(lambda a, b: products.product(a, b, degree=4))
+    call = jax.jit(lambda a, b: low_frequency.product(a, b, degree=4))
     flops = call.lower(jnp.ones((25, 100)), jnp.ones((25, 100))).compile().cost_analysis()["flops"]
     assert flops < 2 * 25**3 * 100
 
 
 def test_what_are_no_coefficients_is_refused():
     with pytest.raises(ValueError, match="must be a square number, got 8"):
-        products.product(jnp.ones(8), jnp.ones(9), degree=2)
+        low_frequency.product(jnp.ones(8), jnp.ones(9), degree=2)
     with pytest.raises(ValueError, match="degree must be at least 0, got -1"):
-        products.operator(jnp.ones(9), degree=-1)
+        low_frequency.operator(jnp.ones(9), degree=-1)
 
 
 def test_the_rule_integrates_up_to_its_degree(close):
-    node, weight = products.quadrature(12)
+    node, weight = harmonics.quadrature(12)
     close(weight.sum(), 4 * np.pi, tolerance=1e-12)
     basis = harmonics.basis(np, node, 6)
     close((basis * weight) @ basis.T, np.eye(49), tolerance=1e-12)

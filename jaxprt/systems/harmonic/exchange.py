@@ -24,7 +24,7 @@ from jaxprt import require
 from jaxprt.files import inputs, outputs
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import directions, harmonics
-from jaxprt.sphere.conventions import Convention
+from jaxprt.sphere.low_frequency import Convention
 from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector
 
 _AGREE = 1e-4  # tolerance, relative to the largest coefficient or to the size of the mesh
@@ -45,7 +45,7 @@ def export_transfer(
         path: Name of the file, with suffix .npz, .npy or .ply. PLY files hold vectors of vertices only.
         transport: Transfer of all vertices of the mesh.
         mesh: The mesh. Its positions and faces are written in the tool's axes.
-        convention: SH convention of the tool, such as `jaxprt.sphere.conventions.TOOLS["Mitsuba 3"]`; the default is
+        convention: SH convention of the tool, such as `jaxprt.sphere.low_frequency.TOOLS["Mitsuba 3"]`; the default is
             that of jaxprt.
         corners: Whether to write a vector for each corner of each triangle instead of each vertex.
 
@@ -128,7 +128,7 @@ def import_transfer(
     stated = _said(source, str(held["convention"])) if "convention" in held else convention
     if stated is None:
         raise ValueError(
-            f"{source} does not say its convention: give convention=jaxprt.sphere.conventions.Convention(..)"
+            f"{source} does not say its convention: give convention=jaxprt.sphere.low_frequency.Convention(..)"
         )
     if convention not in (None, stated):
         raise ValueError(f"the convention must be that of {source} or None, got {convention}: the file says {stated}")

@@ -22,7 +22,7 @@ from jaxprt import require, visibility
 from jaxprt.compile import jit
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
-from jaxprt.sphere import cubemap, directions, haar, harmonics, products, rotation
+from jaxprt.sphere import cubemap, directions, haar, harmonics, rotation
 from jaxprt.visibility.arguments import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
@@ -204,7 +204,7 @@ def from_visibility(
         frame: Shading frame of each vertex; rows are tangent, bitangent, normal. See `right_handed`.
         degree: Highest degree of the matrices.
     """
-    node, weight = (jnp.asarray(each, frame.dtype) for each in products.quadrature(4 * degree))
+    node, weight = (jnp.asarray(each, frame.dtype) for each in harmonics.quadrature(4 * degree))
     basis = harmonics.evaluate(node, degree=degree)
     value = weight[:, None] * (harmonics.evaluate(node, degree=2 * degree) @ coefficient)
     world = jax.lax.map(lambda each: (basis * each[:, None]).T @ basis, value.T)
@@ -226,7 +226,7 @@ def to_visibility(matrix: Float[Array, "b lm lm"], frame: Float[Array, "b 3 3"])
     degree = harmonics.degree_of(matrix.shape[-1])
     back = right_handed(frame).swapaxes(1, 2)
     world = jnp.moveaxis(rotation.rotate_each(jnp.moveaxis(matrix, 0, -1), back), -1, 0)
-    node, weight = (jnp.asarray(each, frame.dtype) for each in products.quadrature(4 * degree))
+    node, weight = (jnp.asarray(each, frame.dtype) for each in harmonics.quadrature(4 * degree))
     basis = harmonics.evaluate(node, degree=degree)
     convolved = jax.lax.map(lambda each: jnp.sum((basis @ each) * basis, -1), world)
     coefficient = (weight[:, None] * harmonics.evaluate(node, degree=2 * degree)).T @ convolved.T

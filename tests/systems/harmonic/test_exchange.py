@@ -15,7 +15,7 @@ from jaxprt import harmonic
 from jaxprt.scene import builtin
 from jaxprt.scene.mesh import make_mesh
 from jaxprt.sphere import directions
-from jaxprt.sphere.conventions import TOOLS, Convention
+from jaxprt.sphere.low_frequency import TOOLS, Convention
 
 RNG = np.random.default_rng(8)
 OTHER = Convention(condon_shortley=True, over_pi=False, order="alternating", axes="+x-z+y")

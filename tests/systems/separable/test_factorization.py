@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.published import maps
 from jaxprt import separable
 from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert
 from jaxprt.brdf.varying import Channels
@@ -19,8 +20,8 @@ def evaluate(brdf, wi, wo):
 
 
 def _texels(resolution):
-    direction = np.asarray(hemisphere.texel_direction(resolution=resolution)).reshape(-1, 3)
-    inside = np.flatnonzero(np.asarray(hemisphere.texel_area(resolution=resolution)).ravel())
+    direction = np.asarray(maps.texel_direction(resolution=resolution)).reshape(-1, 3)
+    inside = np.flatnonzero(np.asarray(maps.texel_area(resolution=resolution)).ravel())
     wi, wo = np.meshgrid(inside, inside)
     return direction[wi.ravel()], direction[wo.ravel()]
 
@@ -61,7 +62,7 @@ def _parabolic_texels(resolution):
 def test_all_terms_reproduce_every_texel():
     resolution = 8
     wi, wo = _parabolic_texels(resolution)
-    inside = np.count_nonzero(hemisphere.texel_area(resolution=resolution))
+    inside = np.count_nonzero(maps.texel_area(resolution=resolution))
     factored = separable.factor(WANG, terms=int(inside), resolution=resolution)
     expected = np.asarray(evaluate(WANG, wi, wo))
     # The last eigenvalues lie below single precision of the first, and with them their share of the norm.
@@ -99,7 +100,7 @@ def test_maps_are_finite_and_continue_beyond_the_rim():
 
 
 def test_prior_is_a_covariance():
-    direction = hemisphere.texel_direction(resolution=10).reshape(-1, 3)
+    direction = maps.texel_direction(resolution=10).reshape(-1, 3)
     covariance = separable.factorization.light_covariance(direction, degree=36)
     np.testing.assert_allclose(covariance, covariance.T, rtol=1e-5)
     assert np.linalg.eigvalsh(np.asarray(covariance, np.float64)).min() > -1e-3
