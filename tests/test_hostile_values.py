@@ -283,6 +283,7 @@ def scene_verbs() -> dict[str, Verb]:
             rays=8,
             path=None,
             executor=None,
+            refine=False,  # Meshes are divided before the other arguments are looked at.
             **common,
         ),
         "plan": Verb(  # Right values take minutes.
