@@ -46,14 +46,14 @@ ONLY_IN = {
     "llvmlite": "jaxprt.visibility.packets",
     "OpenEXR": "jaxprt.files",
     "OpenImageIO": "jaxprt.files",
-    "mmap": "jaxprt.files.mapped",
+    "mmap": "jaxprt.files.arrays",
     "jaxopt": "jaxprt.inverse.solve",
     "IPython": "jaxprt.view.widget",
     "anywidget": "jaxprt.view.widget",
     "traitlets": "jaxprt.view.widget",
     "DracoPy": "jaxprt.scene.formats.gltf_geometry",
     "meshopt": "jaxprt.scene.formats.gltf_file",
-    "opengl_basisu": "jaxprt.files.ktx2",
+    "opengl_basisu": "jaxprt.files.images",
     "fast_simplification": "jaxprt.scene.occluder",
 }
 

@@ -40,8 +40,8 @@ from jaxprt import separable as separable_system
 from jaxprt.brdf.varying import Channels, PerVertex
 from jaxprt.decompose import mixture as mixture_system
 from jaxprt.image import Pixels, raster
+from jaxprt.scene.environment import Sun
 from jaxprt.scene.points import Points
-from jaxprt.scene.suns import Sun
 
 GRADIENT_TOLERANCE = 1e-5  # Central differences in float64, of the norm of the gradient.
 STEP = 1e-6
@@ -60,22 +60,25 @@ HOST = {
     "files": "reads and writes files",
     "scene.points.on_triangles": "checks values",
     "scene.material_table": "takes parts; what they look like at points is in tests/scene/test_material_table.py",
-    "scene.mipmap.levels": "its number of results depends on the size",
+    "scene.texture.mipmap": "its number of results depends on the size",
     "scene.texture.bilinear": "gives numbers of texels",
-    "visibility.buried": "traces rays",
-    "visibility.shown": "traces rays",
-    "visibility.texel_rays": "traces rays",
-    "visibility.lamp_rays": "traces rays",
-    "visibility.lamp_packets": "the same, in numba",
-    "image.layers": "traces rays, and gives points whose number depends on the view",
+    "visibility.picture_rays": "traces rays",
     "image.raster.barycentric": "takes numbers of triangles; tests/image/test_layers.py",
-    "scene.normal_maps": "reads images on the host, and clamps; tests/scene/test_normal_maps.py has SciPy's answers",
-    "scene.part_opacity": "joins images on the host",
+    "scene.texture.unit_normals": "reads images on the host",
+    "scene.texture.tilt_normals": "clamps; tests/scene/test_normal_maps.py has SciPy's answers",
+    "scene.texture.normal_variance": "the same",
+    "scene.texture.widen_roughness": "the same",
     "scene.sides": "copies faces of scenes on the host",
     "sphere.hats.centers": "a NumPy table",
-    "visibility.points": "places rays",
     "image.raster.front": "gives truth values",
     "image.raster.front_faces": "the same",
+    "image.pixels.visible_points": "traces rays, and gives points whose number depends on the view",
+    "image.pixels.coverage": "traces rays",
+    "image.pixels.nearest_fragments": "the same",
+    "image.pixels.seen_from_front": "gives truth values",
+    "image.pixels.sky": "looks up pixels of files, on the host",
+    "image.pixels.pixel_angle": "measures a camera on the host",
+    "image.tonemap.toned": "by NumPy or JAX, as the last argument says; image.tonemap.display is the function",
     "image.pixels.shading_points": "has more padding in jit than outside; tests/image/test_pixels.py",
     "visibility.rays": "traces rays",
     "visibility.occluder": "traces rays",
@@ -181,7 +184,6 @@ HOST = {
     "systems.bounces.functions.shared": "checks values, and turns singular vectors on the host",
     "systems.bounces.functions.fixed_weights": "counts colors by values",
     "systems.bounces.gather.rays": "traces rays",
-    "visibility.hits": "traces rays",
     "systems.bounces.build.precompute": "traces rays",
     "systems.bounces.gather.shares": "NumPy on the host",
     "systems.bounces.gather.cosines": "NumPy on the host",
@@ -219,8 +221,6 @@ HOST = {
     "systems.separable.factorization.light_errors": "draws its own directions",
     "systems.separable.factorization.tabulate": "checks values",
     "image.arguments": "checks values",
-    "scene.mesh_arrays": "checks values",
-    "scene.normals": "NumPy, where data enters",
     "scene.origin": "NumPy in float64, where data enters",
     "scene.camera.localized": "moves a mesh on the host",
     "scene.camera.in_common_coordinates": "decorates functions",
@@ -230,6 +230,7 @@ HOST = {
     "scene.formats": "reads files",
     "scene.scene.numbered": "names",
     "scene.scene.default_camera": "measures a mesh on the host",
+    "scene.material.opacity_of_parts": "joins images on the host",
     "scene.texture.dpdu": "reads a mesh on the host",
     "scene.texture.handedness": "the same",
     "scene.occluder": "simplifies meshes on the host",
@@ -243,14 +244,11 @@ HOST = {
     "scene.environment.environment_from_image": "checks values",
     "scene.environment.layout_of": "reads the shape of an image file",
     "scene.environment.resample": "NumPy in float64, where data enters",
-    "scene.resampling": "the same",
     "scene.panorama": "pixels of files, NumPy on the host",
     "scene.panorama_loops": "the same, by numba",
     "scene.environment.finer": "the same; the light itself without a file",
     "scene.environment.add_disk": "NumPy on the host",
     "scene.environment.sky": "the same; environment.background without a file",
-    "image.skies": "the same",
-    "image.tone_curves": "by NumPy or JAX, as the last argument says; image.tonemap.display is the function",
     "image.metrics.flip": "calls the reference implementation",
     "sphere.cubemap.border_index": "a NumPy table of indices",
     "sphere.harmonics.degree_of": "arithmetic on shapes",
@@ -575,7 +573,7 @@ EXAMPLES = {
     "decompose.mixture.weigh": example(lambda draw: call(draw.normal(9, 2), draw.uniform(9), draw.uniform(2)), steps=3),
     "scene.environment.rotate": example(lambda draw: call(draw.light(2), draw.rotation()), samples=2),
     "scene.light_probes.light_probe": example(lambda draw: call(draw.light()), tool="Unity"),
-    "scene.suns.with_suns": example(
+    "scene.environment.with_suns": example(
         lambda draw: call(draw.light(), (Sun("sun", draw.unit(1)[0], draw.uniform(3)),)), gradient=("light",)
     ),
     "scene.environment.background": example(lambda draw: call(draw.light(), draw.normal(5, 3))),

@@ -22,7 +22,7 @@ from jax._src import compilation_cache
 from jaxprt import Camera
 from jaxprt.compile import kept
 from jaxprt.image import raster
-from jaxprt.programs import executables, jax_cache, names, store
+from jaxprt.programs import executables, jax_cache, store
 from jaxprt.programs.store import Store
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -385,39 +385,39 @@ def test_threads_compile_an_executable_once(kept_files):
 
 
 def test_surroundings_change_with_versions_flags_options_processor_and_code(monkeypatch, tmp_path):
-    found = {names.surroundings()}
-    fixed = inspect.unwrap(names._fixed)
-    monkeypatch.setattr(names, "_fixed", fixed)
+    found = {executables.surroundings()}
+    fixed = inspect.unwrap(executables._fixed)
+    monkeypatch.setattr(executables, "_fixed", fixed)
     for change in (
-        lambda: monkeypatch.setattr(names, "version_str", "0.0.1"),
-        lambda: monkeypatch.setattr(names, "processor", lambda: "another"),
+        lambda: monkeypatch.setattr(executables, "version_str", "0.0.1"),
+        lambda: monkeypatch.setattr(executables, "processor", lambda: "another"),
         lambda: monkeypatch.setenv("XLA_FLAGS", "--another"),
-        lambda: monkeypatch.setattr(names, "_PACKAGE", tmp_path),
+        lambda: monkeypatch.setattr(executables, "_PACKAGE", tmp_path),
         lambda: (tmp_path / "module.py").write_text("1"),
         lambda: (tmp_path / "module.py").write_text("2"),
     ):
         change()
-        monkeypatch.setattr(names, "_STARTED", np.inf)
-        assert names.surroundings() not in found
-        found.add(names.surroundings())
+        monkeypatch.setattr(executables, "_STARTED", np.inf)
+        assert executables.surroundings() not in found
+        found.add(executables.surroundings())
     with jax.default_matmul_precision("float32"):
-        assert names.surroundings() not in found
+        assert executables.surroundings() not in found
     (tmp_path / "__pycache__").mkdir()
     (tmp_path / "__pycache__" / "module.nbi").write_text("of Numba")
-    assert names.surroundings() in found
-    monkeypatch.setattr(names, "_STARTED", 0.0)
-    with pytest.raises(names.UnnamedError, match="has changed"):
-        names.surroundings()
+    assert executables.surroundings() in found
+    monkeypatch.setattr(executables, "_STARTED", 0.0)
+    with pytest.raises(executables.UnnamedError, match="has changed"):
+        executables.surroundings()
 
 
 @pytest.mark.parametrize("value", [lambda: 0, object(), np.ones(2), np.float32(1), {"a": object()}, called_back])
 def test_values_that_have_no_name_are_refused(value):
-    with pytest.raises(names.UnnamedError):
-        names.described(value)
+    with pytest.raises(executables.UnnamedError):
+        executables.described(value)
 
 
 def test_names_tell_values_apart():
     values = [None, 0, 0.0, False, "0", (0,), [0], {"a": 0}, {"b": 0}, np.dtype("f4"), np.dtype("f8"), Camera, axes]
-    assert len({names.described(each) for each in values}) == len(values)
+    assert len({executables.described(each) for each in values}) == len(values)
     structures = [jax.tree.structure(each) for each in (camera(), camera(width=5), (1,), [1], {"a": 1}, None)]
-    assert len({names.described(each) for each in structures}) == len(structures)
+    assert len({executables.described(each) for each in structures}) == len(structures)

@@ -9,7 +9,7 @@ from typing import Any
 import click
 import numpy as np
 
-from jaxprt.cli import inputs, options, play, relight, sizes
+from jaxprt.cli import inputs, options, play, relight
 from jaxprt.cli.options import option
 from jaxprt.files import outputs
 from jaxprt.scene import Environment, light_probe
@@ -126,7 +126,7 @@ def _write(chosen: SimpleNamespace) -> list[dict[str, Any]]:
             rows.append(probes(path, lights, chosen.tool))
             continue
         if ready is None:
-            (recipe,) = sizes.recipes(chosen.system[0], chosen, lobes=play.LOBES).values()
+            (recipe,) = options.recipes(chosen.system[0], chosen, lobes=play.LOBES).values()
             scene = inputs.scene(chosen, playable=True)
             ready = play.prepared(scene, lights, recipe, chosen.bounces, chosen.store)
         if kind == "page":

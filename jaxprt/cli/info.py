@@ -16,7 +16,7 @@ import numpy as np
 
 import jaxprt
 from jaxprt import brdf, compile
-from jaxprt.cli import inputs, materials, options
+from jaxprt.cli import inputs, options
 from jaxprt.cli.options import option
 from jaxprt.files import inputs as regular
 from jaxprt.files import read_image
@@ -134,7 +134,7 @@ def _scene(path: Path, outside: bool) -> dict[str, Any]:
             "triangles": len(part.mesh.face),
             "texture_coordinates": part.mesh.texture is not None,
             "vertex_colors": part.color is not None,
-            "material": materials.describe(part.material),
+            "material": inputs.describe(part.material),
         }
         for part in scene.parts
     ]
@@ -177,7 +177,7 @@ def _brdf(path: Path) -> dict[str, Any]:
         start = file.read(4096)
     if start.startswith(_MERL):
         table = brdf.load_merl(path)
-        return {"kind": "brdf", "form": "merl", "brdf": materials.describe(table), "use": f"merl:{path}"}
+        return {"kind": "brdf", "form": "merl", "brdf": inputs.describe(table), "use": f"merl:{path}"}
     if path.suffix.lower() == ".bin" and path.with_name("merl_npf_materials.txt").exists():
         names = path.with_name("merl_npf_materials.txt").read_text(encoding="utf-8").split()
         brdf.load_npf(path, names[0])
@@ -274,7 +274,7 @@ def _scene_rows(found: dict[str, Any]) -> list[str]:
 
 def _matters(name: str, value: Any) -> bool:
     """Whether a parameter of a material differs from its default in glTF."""
-    default = {key: each for key, each in materials.describe(TexturedMaterial()).items() if key != "model"}
+    default = {key: each for key, each in inputs.describe(TexturedMaterial()).items() if key != "model"}
     return name not in default or not np.array_equal(value, default[name])
 
 

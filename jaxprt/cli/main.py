@@ -11,7 +11,7 @@ import tqdm
 from click.shell_completion import get_completion_class
 
 import jaxprt
-from jaxprt.cli import export, info, materials, measure, options, planned, play, relight
+from jaxprt.cli import export, info, inputs, measure, options, planned, play, relight
 
 _SHELLS = {"bash": "~/.bashrc", "zsh": "~/.zshrc", "fish": "~/.config/fish/completions/jaxprt.fish"}
 _INTERRUPTED = 130
@@ -55,10 +55,10 @@ class Program(click.Group):
 
 _EPILOG = f"""\b
 Materials, for --brdf and --material:
-  models      {", ".join(list(materials.MODELS)[:7])},
-              {", ".join(list(materials.MODELS)[7:])}
+  models      {", ".join(list(inputs.MODELS)[:7])},
+              {", ".join(list(inputs.MODELS)[7:])}
   numbers     ward:diffuse=.1/.05/.02,specular=.3,along=.1,across=.3   colors have slashes
-  files       {", ".join(map(materials.form, materials.FILES))}
+  files       {", ".join(map(inputs.form, inputs.FILES))}
 """
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from jaxprt.cli import inputs, materials, options, report, sizes
+from jaxprt.cli import inputs, options, report
 from jaxprt.cli.options import option
 from jaxprt.cli.report import View
 from jaxprt.relit import RelitScene
@@ -15,7 +15,7 @@ from jaxprt.relit.measuring import Report
 from jaxprt.scene import Part, Scene, builtin
 from jaxprt.scene.camera import orbit
 
-_SYSTEMS = ("planned", *sizes.NAMES)
+_SYSTEMS = ("planned", *options.NAMES)
 _RINGS, _SECTORS = 24, 36
 _VERTICES = 300
 
@@ -65,10 +65,10 @@ def _scene(chosen: SimpleNamespace) -> tuple[dict[str, Any], str]:
     """The report of a scene for each system."""
     scene, lights = inputs.scene(chosen), inputs.lights(chosen)
     systems = chosen.system or ("lobe",)
-    sizes.check(chosen, systems, 6 * next(iter(lights.values())).radiance.shape[-2] ** 2)
+    options.check(chosen, systems, 6 * next(iter(lights.values())).radiance.shape[-2] ** 2)
     made, texts = {}, []
     for system in systems:
-        recipes = {"planned": None} if system == "planned" else sizes.recipes(system, chosen)
+        recipes = {"planned": None} if system == "planned" else options.recipes(system, chosen)
         for name, recipe in recipes.items():
             ready = prepared(scene, lights, recipe, chosen, None if chosen.output is None else chosen.output / system)
             found = ready.report(list(lights.values()))
@@ -128,5 +128,5 @@ def _fit(chosen: SimpleNamespace) -> tuple[dict[str, Any], str]:
     vertex = report.sample(view, _VERTICES)
     right = report.exact_vertices(view, [vertex])[0]
     rows = [row for system in systems for row in report.table(system, view, vertex, right)]
-    found = {"material": materials.describe(chosen.fit), "vertices": len(vertex), "rows": rows}
+    found = {"material": inputs.describe(chosen.fit), "vertices": len(vertex), "rows": rows}
     return found, "\n".join(map(report.row_text, rows))

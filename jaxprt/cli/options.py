@@ -6,14 +6,55 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import click
 from click.shell_completion import CompletionItem
 
-from jaxprt.cli import inputs, materials, sizes
+from jaxprt.cli import inputs
+from jaxprt.relit import Clusters, Harmonics, Lobes, Terms
+from jaxprt.relit.recipes import Recipe
 
+LAPLACIAN = {"none": 1.0, "laplacian": 0.4}  # fraction of the squared Laplacian that each window preserves
+NAMES = ("lobe", "harmonic", "separable", "clusters")
+_COUNT = 12  # default number of lobes
+_TAKEN = {
+    "lobes": ("lobe",),
+    "texels": ("lobe", "clusters"),
+    "terms": ("separable", "clusters", "dynamic"),
+    "keep": ("separable", "clusters"),
+    "components": ("clusters",),
+    "modes": ("clusters",),
+}
 _PATH: Any = click.Path(path_type=Path)
+
+
+def check(options: SimpleNamespace, systems: Sequence[str], texels: int) -> None:
+    """Refuses size options that none of the systems uses, or that exceed the size of the light.
+
+    Raises:
+        ValueError: A size belongs to another system, or there are more wavelet coefficients than texels.
+    """
+    for name, takers in _TAKEN.items():
+        if getattr(options, name) is not None and not set(takers) & set(systems):
+            raise ValueError(f"--{name} needs --system {' or '.join(takers)}, got {','.join(systems)}")
+    if options.keep is not None and options.keep > texels:
+        raise ValueError(f"--keep must be at most {texels}, got {options.keep}")
+
+
+def recipes(system: str, options: SimpleNamespace, *, lobes: int = _COUNT) -> dict[str, Recipe]:
+    """The recipes for a system and the options, by names that are used for folders and files."""
+    if system == "lobe":
+        counts = options.lobes or (lobes,)
+        more = {} if options.texels is None else {"texels": options.texels}
+        names = [system] if len(counts) == 1 else [f"lobe_{count}" for count in counts]
+        return {name: Lobes(count, **more) for name, count in zip(names, counts, strict=True)}
+    if system == "harmonic":
+        return {system: Harmonics(options.order - 1, LAPLACIAN[options.window])}
+    names = ("terms", "keep") if system == "separable" else ("terms", "keep", "components", "modes", "texels")
+    given = {name: value for name in names if (value := getattr(options, name)) is not None}
+    return {system: Terms(**given) if system == "separable" else Clusters(**given)}
 
 
 class Command(click.Command):
@@ -183,7 +224,7 @@ class Material(click.ParamType):
             click.UsageError: The text is not a material.
         """
         try:
-            return materials.parse(value) if isinstance(value, str) else value
+            return inputs.parse(value) if isinstance(value, str) else value
         except (ValueError, OSError) as error:
             self.fail(said(error), param, ctx)
 
@@ -191,10 +232,10 @@ class Material(click.ParamType):
         """Completes the name, then its parameters."""
         name, colon, rest = incomplete.partition(":")
         if not colon:
-            names = dict.fromkeys([*materials.MODELS, *materials.FILES])
+            names = dict.fromkeys([*inputs.MODELS, *inputs.FILES])
             return [CompletionItem(f"{each}:") for each in names if each.startswith(name)]
         before, comma, last = rest.rpartition(",")
-        known = materials.parameters(name) if name in materials.MODELS else {}
+        known = inputs.parameters(name) if name in inputs.MODELS else {}
         return [CompletionItem(f"{name}:{before}{comma}{each}=") for each in known if each.startswith(last)]
 
 
@@ -212,7 +253,7 @@ class OfPart(Material):
         if not isinstance(value, str):
             return value
         try:
-            part, material = materials.of_part(value)
+            part, material = inputs.of_part(value)
         except ValueError as error:
             self.fail(str(error), param, ctx)
         return part, super().convert(material, param, ctx)
@@ -351,7 +392,7 @@ few_sizes = together(
     option(
         "--window",
         group="Sizes",
-        type=click.Choice(list(sizes.LAPLACIAN)),
+        type=click.Choice(list(LAPLACIAN)),
         default="laplacian",
         show_default=True,
         help="Window against ringing on glossy parts (harmonic).",

@@ -12,13 +12,13 @@ from typing import Any
 
 import click
 
-from jaxprt.cli import inputs, options, relight, sizes
+from jaxprt.cli import inputs, options, relight
 from jaxprt.cli.options import option
 from jaxprt.relit import RelitScene
 from jaxprt.relit.build import precompute
 from jaxprt.scene import Environment, Scene
 from jaxprt.view import serve
-from jaxprt.view.address import parse
+from jaxprt.view.server import parse
 
 LOBES = 8  # the smallest number whose tables are shipped; fewer lobes take less time per look
 _PATIENCE = 0.5  # seconds; `jaxprt.cli.main.run` ends a process whose threads still compute
@@ -141,7 +141,7 @@ def ready(given: SimpleNamespace) -> tuple[dict[str, RelitScene], dict[str, Envi
     scene, lights = inputs.scene(given, playable=True), inputs.lights(given)
     made = {}
     for system in given.system:
-        recipes = sizes.recipes(system, given, lobes=LOBES)
+        recipes = options.recipes(system, given, lobes=LOBES)
         for recipe in recipes.values():
             shown = f"{recipe.lobes} lobes" if system == "lobe" else "harmonics"  # pyright: ignore
             path = None if given.output is None else given.output / system  # shared by systems with any number of lobes

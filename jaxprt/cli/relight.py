@@ -14,15 +14,15 @@ import jax
 import numpy as np
 
 import jaxprt
-from jaxprt.cli import animation, inputs, materials, options, report, sizes
+from jaxprt.cli import animation, inputs, options, report
 from jaxprt.cli.options import option
 from jaxprt.cli.report import Made, View
 from jaxprt.files import outputs
-from jaxprt.image.tone_curves import TONES
+from jaxprt.image.tonemap import TONES
 from jaxprt.relit.planning import Plan
 from jaxprt.visibility import blocks
 
-SYSTEMS = ("planned", *sizes.NAMES, "dynamic")
+SYSTEMS = ("planned", *options.NAMES, "dynamic")
 
 
 @click.command(cls=options.Command, short_help="Render a scene under lights, and measure errors.")
@@ -104,7 +104,7 @@ def _run(chosen: SimpleNamespace) -> dict[str, Any]:
     systems, part = _systems(chosen), _part(chosen.part)
     plan = saved(chosen.saved) if chosen.saved is not None else None
     view = inputs.view(chosen, size=64 if plan is None else plan.size)
-    sizes.check(chosen, systems, 6 * next(iter(view.lights.values())).radiance.shape[-2] ** 2)
+    options.check(chosen, systems, 6 * next(iter(view.lights.values())).radiance.shape[-2] ** 2)
     make_folder(chosen.output)
     if part is not None:
         return {"unfinished": _share(view, chosen, systems, plan, part)}
@@ -235,7 +235,7 @@ def _made(
         return {system: report.make(view, plan.recipes, output / system, bounces=bounces, **more)}
     if system == "planned":
         return {system: report.plan(view, output / system, error=chosen.error, bounces=chosen.bounces, **more)}
-    made = sizes.recipes(system, chosen)
+    made = options.recipes(system, chosen)
     # Data that does not depend on the number of lobes is shared in one folder.
     return {
         name: report.make(view, recipe, output / system, bounces=chosen.bounces, **more)
@@ -262,7 +262,7 @@ def _describe(view: View, chosen: SimpleNamespace) -> dict[str, Any]:
         "turn": list(chosen.turn),
         "light_size": next(iter(view.lights.values())).radiance.shape[-2],
         "vertices": {part.name: len(part.mesh.position) for part in view.scene.parts},
-        "brdf": {part.name: materials.describe(part.material) for part in view.scene.parts},
+        "brdf": {part.name: inputs.describe(part.material) for part in view.scene.parts},
         "camera": {
             name: np.asarray(value).tolist()
             for name, value in vars(view.camera).items()

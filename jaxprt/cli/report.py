@@ -17,7 +17,7 @@ from jaxtyping import Array
 
 from jaxprt import files, image, relit, visibility
 from jaxprt.files import objects
-from jaxprt.image import layers
+from jaxprt.image import pixels
 from jaxprt.relit import measuring, regions
 from jaxprt.relit.channels import Shading, of_part
 from jaxprt.relit.exact import ExactPicture, ExactPixels, exact_picture, exact_pixels
@@ -224,7 +224,7 @@ def _points(view: View) -> image.Pixels:
     mesh = view.scene.mesh
     hidden = sides.hidden_backs(view.scene)[np.asarray(mesh.region)[np.asarray(mesh.face)[:, 0]]]
     occluder = None if mesh.opacity is None else visibility.Occluder(mesh)
-    return layers.visible_points(mesh, view.camera, samples=4, hidden=hidden, occluder=occluder)
+    return pixels.visible_points(mesh, view.camera, samples=4, hidden=hidden, occluder=occluder)
 
 
 def seen(view: View) -> list[np.ndarray]:

@@ -5,27 +5,35 @@ blocks. Every block has its own place in each file, so processes on one machine 
 coordination. Any program that reads NumPy's format can map the arrays. A block counts only if its checksum is present
 and correct. A process may therefore be killed at any moment, and files may be lost or truncated: every block that is
 read is either as written or reported missing.
+
+A mapped array takes no memory of its own: the operating system reads its pages when they are first used, and drops
+them when memory is short. On CPUs, `jax.device_put` uses such an array without a copy, because its values begin at a
+multiple of 64 bytes. On other devices it copies.
 """
 
 import contextlib
 import errno
 import functools
 import json
+import mmap
 import os
 import re
 import shutil
 import uuid
+import weakref
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import filelock
 import numpy as np
 
-from jaxprt.files import inputs, mapped
+from jaxprt.files import inputs
 
+ALIGN = 64  # alignment in bytes at which JAX needs no copy; values in NumPy's format have it too
+_VERSION = (1, 0)
 VERSION = 4
 _FORMAT = "jaxprt blocks"
 _HEADER = "store.json"
@@ -36,6 +44,119 @@ _SUMS = 32
 _PART = 1 << 20  # values per partial sum
 _MOST = 1e300  # largest number in a sketch
 _STRIDE = 7919  # shift of the random signs from one part to the next
+
+
+def write_header(file: BinaryIO, shape: tuple[int, ...], dtype: str) -> None:
+    """Writes the header of an array in NumPy's format, which precedes its values."""
+    descr = np.lib.format.dtype_to_descr(np.dtype(dtype))
+    np.lib.format.write_array_header_1_0(file, {"descr": descr, "fortran_order": False, "shape": shape})
+
+
+def read_header(path: Path, shape: tuple[int, ...], dtype: str) -> int:
+    """Byte offset of the values of an array in its file.
+
+    Raises:
+        ValueError: The file is not in NumPy's format, or has another shape or type.
+    """
+    with path.open("rb") as file:
+        version = np.lib.format.read_magic(file)
+        if version != _VERSION:
+            raise ValueError(f"{path} must have version {_VERSION} of NumPy's format, got {version}")
+        found, fortran, kind = np.lib.format.read_array_header_1_0(file)
+        if (found, fortran, kind) != (tuple(shape), False, np.dtype(dtype)):
+            raise ValueError(f"{path} must be {dtype} {list(shape)}, got {kind} {list(found)}")
+        return file.tell()
+
+
+def open_array(path: Path, offset: int, shape: tuple[int, ...], dtype: str) -> np.ndarray:
+    """A read-only memory map of an array in a file.
+
+    Raises:
+        ValueError: The file is too short.
+    """
+    if 0 in shape:
+        return np.zeros(shape, dtype)
+    end = offset + int(np.prod(shape)) * np.dtype(dtype).itemsize
+    with path.open("rb") as file:
+        status = os.fstat(file.fileno())
+        try:
+            memory = mmap.mmap(file.fileno(), end, access=mmap.ACCESS_READ)
+        except ValueError as error:
+            raise ValueError(f"{path} must have {end} bytes, got {path.stat().st_size}: it is cut off") from error
+    result = np.frombuffer(memory, dtype, int(np.prod(shape)), offset).reshape(shape)
+    _maps[result.ctypes.data] = str(path.absolute()), offset, (status.st_dev, status.st_ino)
+    weakref.finalize(memory, _maps.pop, result.ctypes.data)
+    return result
+
+
+class Reference(NamedTuple):
+    """Location of an array's values in a file. It is sent to other processes in place of the memory map.
+
+    Attributes:
+        path: Absolute path of the file.
+        offset: Offset of the first value in bytes.
+        shape: Shape of the array.
+        dtype: Element type of the array, in NumPy's notation.
+    """
+
+    path: str
+    offset: int
+    shape: tuple[int, ...]
+    dtype: str
+
+    def open(self) -> np.ndarray:
+        """Maps the array in this process.
+
+        Raises:
+            FileNotFoundError: This machine has no access to the file.
+        """
+        try:
+            return open_array(Path(self.path), *self[1:])
+        except FileNotFoundError as error:
+            raise FileNotFoundError(f"{self.path} must be seen by all workers, in a folder that they share") from error
+
+
+def reference(array: np.ndarray) -> np.ndarray | Reference:
+    """Returns the file reference of a memory-mapped array.
+
+    Returns the array itself if it is not a memory map, or if its file has been deleted or replaced.
+    """
+    found = _maps.get(array.ctypes.data) if array.size and array.flags.c_contiguous else None
+    if found is None:
+        return array
+    path, offset, file = found
+    try:
+        status = os.stat(path)
+    except OSError:
+        return array
+    same = (status.st_dev, status.st_ino) == file
+    return Reference(path, offset, array.shape, array.dtype.str) if same else array
+
+
+# For each live map, by address: its file, its offset, and the device and inode of the file.
+_maps: dict[int, tuple[str, int, tuple[int, int]]] = {}
+
+
+def empty(shape: tuple[int, ...], dtype: str) -> np.ndarray:
+    """An uninitialized array in memory, aligned so that JAX uses it without a copy."""
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    flat = np.empty(size + ALIGN, np.uint8)
+    first = -flat.ctypes.data % ALIGN
+    return flat[first : first + size].view(dtype).reshape(shape)
+
+
+def read_into(file: Any, value: np.ndarray) -> None:
+    """Fills an array with the next bytes of an unbuffered file.
+
+    Raises:
+        EOFError: The file ends too early.
+    """
+    left = value.reshape(-1).view(np.uint8).data
+    while left:
+        count = file.readinto(left)
+        if not count:
+            raise EOFError(f"{file.name} ends {len(left)} bytes too early")
+        left = left[count:]
 
 
 class Layout(NamedTuple):
@@ -174,9 +295,9 @@ class BlockStore:
         at = self._layout[name]
         if not at.axis:
             shape = _stored(at, self._blocks)
-            return mapped.open_array(self.path / f"{name}.npy", self._offset[name], shape, at.dtype)[:count]
+            return open_array(self.path / f"{name}.npy", self._offset[name], shape, at.dtype)[:count]
         size, before = at.shape[at.axis], (slice(None),) * at.axis
-        result = mapped.empty((*at.shape[: at.axis], count, *at.shape[at.axis + 1 :]), at.dtype)
+        result = empty((*at.shape[: at.axis], count, *at.shape[at.axis + 1 :]), at.dtype)
         for block in range(self._blocks):
             first = block * size
             found = self._get(name, block, at.shape, at.dtype)
@@ -202,7 +323,7 @@ class BlockStore:
         value = np.empty(shape, dtype)
         with (self.path / f"{name}.npy").open("rb", buffering=0) as file:
             file.seek(self._offset[name] + block * value.nbytes)
-            mapped.read_into(file, value)
+            read_into(file, value)
         return value
 
 
@@ -244,7 +365,7 @@ def _create(path: Path, header: Mapping[str, Any], files: Mapping[str, tuple[tup
         aside.mkdir(parents=True)
         for name, (shape, dtype) in files.items():
             with (aside / f"{name}.npy").open("xb") as file:
-                mapped.write_header(file, shape, dtype)
+                write_header(file, shape, dtype)
         (aside / _HEADER).write_text(json.dumps({**header, "key": uuid.uuid4().hex}))
         try:
             aside.rename(path)
@@ -313,7 +434,7 @@ def _offset(path: Path, name: str, shape: tuple[int, ...], dtype: str) -> int:
     file = path / f"{name}.npy"
     try:
         _check_files(path, file.name)
-        return mapped.read_header(file, shape, dtype)
+        return read_header(file, shape, dtype)
     except FileNotFoundError:
         raise ValueError(f"{path} lacks the array {name}: it is damaged; delete it to start anew") from None
     except Exception as error:  # NumPy raises other errors for some damaged headers

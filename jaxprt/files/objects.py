@@ -3,12 +3,23 @@
 A saved object is a folder with a NumPy file for each array and a JSON description of the object's classes and fields.
 It contains no pickle. Loading creates only objects of this package's classes and fills their fields; it never calls a
 function that a file names.
+
+A folder may come from a stranger. Nothing is unpickled, only data classes of this package are looked up, and only
+regular files in the folder are read. Whatever differs from what `jaxprt.files.objects.save` writes is refused.
 """
 
+import collections.abc
 import dataclasses
+import functools
+import importlib
+import inspect
 import json
 import os
+import re
 import shutil
+import sys
+import types
+import typing
 import zlib
 from functools import partial
 from pathlib import Path
@@ -16,11 +27,400 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 from jax.core import Tracer
 
 from jaxprt import require
-from jaxprt.files import fields, loading, mapped
+from jaxprt.files import arrays, inputs
+
+_PLAIN: dict[Any, tuple[type, ...]] = {
+    bool: (bool, np.bool_),
+    int: (int, np.integer),
+    float: (float, int, np.floating, np.integer),
+    str: (str,),
+}
+VERSION = 2
+FORMAT = "jaxprt object"
+HEADER = "object.json"
+# Functions that fields may hold. Files and pickles store their names.
+_FUNCTIONS = {
+    "jaxprt.sphere.hemisphere:disk_coordinates",
+    "jaxprt.sphere.hemisphere:parabolic_coordinates",
+    "jaxprt.sphere.hemisphere:polar_coordinates",
+    "jaxprt.brdf.navigation:_identity",
+    "jaxprt.brdf.navigation:_log",
+    "jaxprt.brdf.navigation:_log_roughness",
+    "jaxprt.brdf.places:identity",
+}
+
+
+def names(kind: Any) -> list[str]:
+    """Names of the fields of a data class or a named tuple."""
+    if dataclasses.is_dataclass(kind):
+        return [field.name for field in dataclasses.fields(kind)]
+    return list(kind._fields)
+
+
+def check(value: Any, *, batched: bool = False) -> None:
+    """Refuses an object whose fields do not hold what its class says, and runs the checks of the class.
+
+    Arrays must have the annotated kind of numbers and the annotated axes. Axes of one name have one size in all fields.
+    They may be NumPy arrays where the class says JAX. Loading calls no constructors, which run the checks of classes.
+
+    Args:
+        value: An object of a data class or a named tuple.
+        batched: Whether arrays may have further leading axes; see `holds_models`.
+
+    Raises:
+        ValueError: A field holds something else, or a check of the class fails.
+    """
+    kind = type(value)
+    with jaxtyping.jaxtyped("context"):
+        for name in names(kind):
+            content, hint = getattr(value, name), _hints(kind)[name]
+            if not _fits(content, hint, batched):
+                raise ValueError(f"{name} of {kind.__name__} must be {_text(hint)}, got {_described(content)}")
+    _run_checks(value)
+
+
+def _run_checks(value: Any) -> None:
+    """Calls the checks that constructors of `equinox.Module` call: those of all base classes."""
+    for base in type(value).__mro__:
+        if "__check_init__" in vars(base):
+            try:
+                vars(base)["__check_init__"](value)
+            except Exception as error:
+                raise ValueError(str(error)) from error
+
+
+def holds_models(kind: type, name: str) -> bool:
+    """Whether a field holds any BRDF. Arrays of its model may have further leading axes, of vertices or of a set."""
+    hint = _hints(kind)[name]
+    several = typing.get_origin(hint) in (tuple, typing.Union, types.UnionType)
+    items = typing.get_args(hint) if several else (hint,)
+    return any(item is Any or _is_callable(item) for item in items)
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    return typing.get_type_hints(kind)
+
+
+def _fits(value: Any, hint: Any, batched: bool) -> bool:
+    """Whether a value is what an annotation says. Annotations of no simple form allow everything."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if hint is None or hint is type(None):
+        return value is None
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, option, batched) for option in arguments)
+    if _is_callable(hint):
+        return callable(value)
+    if origin in (tuple, list):
+        return isinstance(value, origin) and _items_fit(value, origin, arguments, batched)
+    if origin in (dict, collections.abc.Mapping):
+        return isinstance(value, dict) and all(_fits(item, arguments[1], batched) for item in value.values())
+    if origin is not None or not inspect.isclass(hint) or hint in (Any, jaxtyping.PyTree):
+        return True
+    if issubclass(hint, jaxtyping.AbstractArray):
+        return _array_fits(value, hint, batched)
+    if hint in (np.ndarray, jax.Array):
+        return isinstance(value, np.ndarray | jax.Array)
+    if hint in _PLAIN:
+        return isinstance(value, _PLAIN[hint]) and (hint is bool or not isinstance(value, bool | np.bool_))
+    return isinstance(value, hint)
+
+
+def _items_fit(value: Any, origin: type, arguments: tuple, batched: bool) -> bool:
+    if origin is list or arguments[1:] == (...,):
+        return all(_fits(item, arguments[0], batched) for item in value)
+    return len(value) == len(arguments) and all(map(_fits, value, arguments, [batched] * len(value)))
+
+
+def _array_fits(value: Any, hint: Any, batched: bool) -> bool:
+    """Whether an array of JAX or NumPy has the annotated numbers and axes. Plain numbers may stand for axes of none."""
+    if isinstance(value, bool | int | float | complex | np.generic):
+        value = np.asarray(value)
+    if not isinstance(value, np.ndarray | jax.Array):
+        return False
+    axes = hint.dim_str
+    if batched and "*" not in axes and "..." not in axes:
+        axes = f"... {axes}"
+    return isinstance(value, hint.dtype[type(value) if isinstance(value, np.ndarray) else jax.Array, axes])
+
+
+def _is_callable(hint: Any) -> bool:
+    return collections.abc.Callable in (hint, typing.get_origin(hint))
+
+
+def _text(hint: Any) -> str:
+    if inspect.isclass(hint) and issubclass(hint, jaxtyping.AbstractArray):
+        return f"an array {hint.dtype.__name__}[{hint.dim_str}]"
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(map(_text, arguments))
+    if origin is tuple:
+        return f"a tuple of {', '.join('...' if item is ... else _text(item) for item in arguments)}"
+    if hint is type(None):
+        return "None"
+    return getattr(hint, "__name__", str(hint))
+
+
+def _described(value: Any) -> str:
+    if isinstance(value, np.ndarray | jax.Array):
+        return f"an array of {value.dtype} {list(value.shape)}"
+    if value is None or isinstance(value, bool | int | float | str):
+        return repr(value)[:80]
+    return f"a {type(value).__name__}"
+
+
+def load_folder(path: Path) -> Any:
+    """The object in a folder; `jaxprt.files.objects.load` explains it."""
+    if not os.path.exists(path):  # unlike Path.exists, False for names that no file can have
+        raise FileNotFoundError(f"{path}: there is no such folder")
+    try:
+        header = _header(path)
+    except Exception as error:
+        raise ValueError(
+            f"{path} must be a folder that jaxprt.files.save wrote, got one that cannot be read: it is damaged, {error}"
+        ) from error
+    if header.get("format") != FORMAT:
+        came = str(header.get("format", "another kind of folder"))[:80]
+        raise ValueError(f"{path} must be a folder that jaxprt.files.save wrote, got {came}, or it is damaged")
+    version, text = header.get("version"), header.get("content")
+    if version != VERSION or type(version) is not int:
+        newer = isinstance(version, int) and version > VERSION
+        cure = "update jaxprt" if newer else "load it with the version of jaxprt that saved it"
+        raise ValueError(
+            f"{path} must have format version {VERSION}, got {str(version)[:80]}: {cure}, or it is damaged"
+        )
+    if not isinstance(text, str) or zlib.crc32(text.encode("utf-8", "replace")) != header.get("checksum"):
+        raise ValueError(f"{path} is damaged: its description is not what was saved")
+    try:
+        return _Reader(path, json.loads(text)).value
+    except _KnownError as error:
+        raise ValueError(str(error)) from error
+    except MemoryError:
+        raise
+    except RecursionError:
+        raise ValueError(f"{path} is damaged: its description is nested too deeply") from None
+    except Exception as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def construct(kind: type, field: dict[str, Any]) -> Any:
+    """An object with these fields. Nothing is converted, checked or called, as when JAX unflattens a pytree."""
+    if not dataclasses.is_dataclass(kind):
+        return tuple.__new__(kind, field.values())
+    result = object.__new__(kind)
+    for name, value in field.items():
+        object.__setattr__(result, name, value)
+    return result
+
+
+class _KnownError(Exception):
+    """A folder that cannot be loaded for a reason other than damage."""
+
+
+class _Reader:
+    """Makes the object that a description states. Whatever does not have the form that `save` writes is refused.
+
+    Attributes:
+        value: The object.
+    """
+
+    def __init__(self, path: Path, content: Any):
+        self._path = path
+        tree, table, self._algorithm = _parts(content, {"tree": dict, "array": list, "algorithm": dict})
+        for name, version in self._algorithm.items():
+            self._check_algorithm(name, version)
+        self._arrays: list[Any] = [_read(path, number, entry) for number, entry in enumerate(table)]
+        self.value = self._make(tree, False)
+
+    def _check_algorithm(self, name: str, version: Any) -> None:
+        _check_module(name)
+        if algorithm_of(name) != version:
+            raise _KnownError(
+                f"{self._path} was made by version {str(version)[:80]} of the algorithm in {name}, this jaxprt has "
+                f"version {algorithm_of(name)}, which gives other results, or it is damaged: compute it again"
+            )
+
+    def _make(self, node: Any, batched: bool) -> Any:
+        """The value that a node of the description represents."""
+        kinds = {"value", "array", "tuple", "list", "dict", "function", "class"} & set(node)
+        if len(kinds) != 1:
+            raise ValueError(f"its description must have one kind for each value, got {', '.join(map(str, node))}")
+        (kind,) = kinds
+        if kind == "value":
+            (value,) = _parts(node, {"value": object})
+            if value is not None and not isinstance(value, bool | int | float | str):
+                raise ValueError(f"a plain value must be a number or text, got a {type(value).__name__}")
+            return value
+        if kind == "array":
+            return self._array(*_parts(node, {"array": int, "kind": str}))
+        if kind in ("tuple", "list"):
+            (items,) = _parts(node, {kind: list})
+            return (tuple if kind == "tuple" else list)(self._make(item, batched) for item in items)
+        if kind == "dict":
+            (items,) = _parts(node, {"dict": dict})
+            return {key: self._make(item, batched) for key, item in items.items()}
+        if kind == "function":
+            (name,) = _parts(node, {"function": str})
+            if name not in _FUNCTIONS:
+                raise _KnownError(
+                    f"{self._path} names the function {name!r}, which this version of jaxprt does not save: it is "
+                    "damaged, or was saved by another version"
+                )
+            return function(name)
+        name, field = _parts(node, {"class": str, "field": dict})
+        return self._object(name, field, batched)
+
+    def _object(self, name: str, field: dict[str, Any], batched: bool) -> Any:
+        kind = _class(self._path, name)
+        if list(field) != names(kind):
+            raise _KnownError(
+                f"{self._path} holds a {name} with the fields {', '.join(field)}, this jaxprt's has "
+                f"{', '.join(names(kind))}: load it with the version of jaxprt that saved it, or it is damaged"
+            )
+        if kind.__module__ not in self._algorithm:
+            raise ValueError(f"its description must state the algorithm of {kind.__module__}, got none")
+        result = construct(
+            kind, {key: self._make(node, batched or holds_models(kind, key)) for key, node in field.items()}
+        )
+        check(result, batched=batched)
+        return result
+
+    def _array(self, number: int, kind: str) -> Any:
+        """An array of its original kind. Fields that share an array share the loaded one."""
+        if not 0 <= number < len(self._arrays) or kind not in ("jax", "numpy", "scalar"):
+            raise ValueError(f"its arrays must be from 0 to {len(self._arrays) - 1}, got {kind[:80]!r} array {number}")
+        value = self._arrays[number]
+        if kind == "scalar":
+            if value.shape:
+                raise ValueError(f"array {number} must be a single number, got {list(value.shape)}")
+            return value[()]
+        if kind == "numpy" and isinstance(value, np.ndarray) and not value.flags.writeable:
+            self._arrays[number] = value = np.array(value)
+        if kind == "jax" and isinstance(value, np.ndarray):
+            if jax.dtypes.canonicalize_dtype(value.dtype) != value.dtype:
+                raise _KnownError(
+                    f"{self._path} holds arrays of {value.dtype}, which JAX has only with jax_enable_x64: enable it to "
+                    "load them, or it is damaged"
+                )
+            self._arrays[number] = value = jax.device_put(value)
+        return value
+
+
+def _parts(node: Any, form: dict[str, type]) -> list[Any]:
+    """The values of an object in the description, which must have these names and types and no others."""
+    if not isinstance(node, dict) or set(node) != set(form):
+        came = ", ".join(map(str, node))[:80] if isinstance(node, dict) else f"a {type(node).__name__}"
+        raise ValueError(f"its description must have {', '.join(form)} together, got {came}")
+    for name, kind in form.items():
+        value = node[name]
+        if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+            raise ValueError(f"{name} of its description must be a {kind.__name__}, got a {type(value).__name__}")
+    return [node[name] for name in form]
+
+
+def _read(path: Path, number: int, entry: Any) -> np.ndarray:
+    """Maps an array and verifies its checksum."""
+    name, shape, expected = _parts(entry, {"dtype": str, "shape": list, "checksum": int})
+    what = f"array {number} of {name[:40]} {str(shape)[:80]}"
+    if not all(type(size) is int and size >= 0 for size in shape):
+        raise ValueError(f"{what} must have a shape of whole numbers")
+    try:
+        dtype = jnp.dtype(name)
+        if dtype.name != name or (dtype.kind not in "biufc" and not is_extended(dtype)):
+            raise ValueError("it is not of numbers")
+        kind = storable(np.empty(0, dtype)).dtype.str
+        file = path / f"{number}.npy"
+        inputs.check_unlinked(file, "an array of a saved object")
+        value = arrays.open_array(file, arrays.read_header(file, tuple(shape), kind), tuple(shape), kind).view(dtype)
+        right = checksum(value) == expected
+    except Exception as error:
+        raise ValueError(f"{what} cannot be read: {error}") from error
+    if not right:
+        raise ValueError(f"{what} is not what was saved")
+    return value
+
+
+def _class(path: Path, name: str) -> type:
+    """A data class of this package, by name. Nothing else is ever looked up."""
+    module, _, kind = name.partition(":")
+    try:
+        _check_module(module)
+    except ValueError as error:
+        raise _KnownError(f"{path} {error}") from None
+    result = getattr(sys.modules[module], kind, None)
+    if not isinstance(result, type) or result.__module__ != module or not is_ours(result):
+        raise _KnownError(
+            f"{path} names the class {name[:80]!r}, which this jaxprt does not have: it is damaged, or was saved by "
+            "another version"
+        )
+    return result
+
+
+def _check_module(name: str) -> None:
+    """Imports a module of this package. Refuses all other modules."""
+    try:
+        if not re.fullmatch(r"jaxprt(\.[a-z][a-z_]*)+", name):
+            raise ImportError(name)
+        importlib.import_module(name)
+    except ImportError:
+        raise ValueError(
+            f"names the module {name[:80]!r}, which this jaxprt does not have: it is damaged, or was saved by another "
+            "version"
+        ) from None
+
+
+def is_ours(kind: type) -> bool:
+    """Whether a class is a data class or a named tuple of this package."""
+    named = issubclass(kind, tuple) and hasattr(kind, "_fields")
+    return kind.__module__.startswith("jaxprt.") and (dataclasses.is_dataclass(kind) or named)
+
+
+def algorithm_of(module: str) -> Any:
+    """Versions of the algorithms that compute the objects of a module."""
+    return getattr(sys.modules[module], "ALGORITHM", 1)
+
+
+def function_name(value: Any) -> str | None:
+    """Name under which files store a function; None for what is not one of those functions."""
+    name = f"{getattr(value, '__module__', None)}:{getattr(value, '__qualname__', None)}"
+    return name if name in _FUNCTIONS else None
+
+
+def function(name: str) -> Any:
+    """The function that `function_name` names."""
+    module, _, inner = name.partition(":")
+    return getattr(importlib.import_module(module), inner)
+
+
+def is_extended(dtype: np.dtype) -> bool:
+    """Whether a type is one that JAX adds to NumPy's, such as bfloat16."""
+    return dtype.type.__module__ == "ml_dtypes"
+
+
+def storable(value: np.ndarray) -> np.ndarray:
+    """The array in a type of NumPy's own. Arrays of other types are reinterpreted as integers of equal size."""
+    return value.view(f"uint{8 * value.dtype.itemsize}") if is_extended(value.dtype) else value
+
+
+def checksum(value: np.ndarray) -> int:
+    """CRC-32 of the values of an array."""
+    return zlib.crc32(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data)
+
+
+def _header(path: Path) -> dict[str, Any]:
+    """The header of a saved object, of the current version or of version 1, which zarr wrote."""
+    if (path / HEADER).exists():
+        inputs.check_unlinked(path / HEADER, "an object that jaxprt.files.save wrote")
+        return inputs.json_object(path / HEADER, "the description of a saved object")
+    if (path / "zarr.json").exists():
+        inputs.check_unlinked(path / "zarr.json", "an object that jaxprt.files.save wrote")
+        return dict(inputs.json_object(path / "zarr.json", "the description of a saved object").get("attributes", {}))
+    return {}
 
 
 @require.arguments(path=partial(require.path, "path"))
@@ -47,23 +447,21 @@ def save(path: str | os.PathLike, object: Any) -> None:
     arrays: list[tuple[Any, np.ndarray]] = []
     modules: set[str] = set()
     tree = _describe(object, type(object).__name__, arrays, modules)
-    table = [
-        {"dtype": array.dtype.name, "shape": array.shape, "checksum": loading.checksum(array)} for _, array in arrays
-    ]
-    algorithm = {name: loading.algorithm(name) for name in modules}
+    table = [{"dtype": array.dtype.name, "shape": array.shape, "checksum": checksum(array)} for _, array in arrays]
+    algorithm = {name: algorithm_of(name) for name in modules}
     content = json.dumps({"tree": tree, "array": table, "algorithm": algorithm})
-    header = {"format": loading.FORMAT, "version": loading.VERSION}
+    header = {"format": FORMAT, "version": VERSION}
     header |= {"content": content, "checksum": zlib.crc32(content.encode())}
     aside = path.with_name(f"{path.name}.{os.getpid()}.new")
     shutil.rmtree(aside, ignore_errors=True)
     try:
         aside.mkdir(parents=True)
         for number, (_, each) in enumerate(arrays):
-            stored = loading.storable(each)
+            stored = storable(each)
             with (aside / f"{number}.npy").open("xb") as file:
-                mapped.write_header(file, stored.shape, stored.dtype.str)
+                write_header(file, stored.shape, stored.dtype.str)
                 file.write(stored.reshape(-1).view(np.uint8).data)
-        (aside / loading.HEADER).write_text(json.dumps(header))
+        (aside / HEADER).write_text(json.dumps(header))
         if path.exists():
             raise FileExistsError(f"{path} exists; remove it or name another path")
         aside.rename(path)
@@ -89,7 +487,7 @@ def load(path: str | os.PathLike) -> Any:
         ValueError: The folder was not written by `save`, is damaged, was saved by a newer version of this package or by
             a version whose algorithms give other results, or holds 64-bit numbers while JAX is set to 32 bits.
     """
-    return loading.load(Path(path))
+    return load_folder(Path(path))
 
 
 def reduced(object: Any) -> tuple:
@@ -101,12 +499,12 @@ def reduced(object: Any) -> tuple:
         object: A dataclass or Module of this package.
     """
     field = {each.name: getattr(object, each.name) for each in dataclasses.fields(object)}
-    name = {key: found for key, value in field.items() if (found := loading.function_name(value)) is not None}
+    name = {key: found for key, value in field.items() if (found := function_name(value)) is not None}
     return _restored, (type(object), {key: value for key, value in field.items() if key not in name}, name)
 
 
 def _restored(kind: type, field: dict[str, Any], name: dict[str, str]) -> Any:
-    return loading.construct(kind, field | {key: loading.function(path) for key, path in name.items()})
+    return construct(kind, field | {key: function(path) for key, path in name.items()})
 
 
 def _describe(value: Any, place: str, arrays: list, modules: set[str], batched: bool = False) -> dict[str, Any]:
@@ -121,21 +519,19 @@ def _describe(value: Any, place: str, arrays: list, modules: set[str], batched: 
     if type(value) is dict and all(isinstance(key, str) for key in value):
         items = {key: _describe(item, f"{place}[{key!r}]", arrays, modules, batched) for key, item in value.items()}
         return {"dict": items}
-    if (name := loading.function_name(value)) is not None:
+    if (name := function_name(value)) is not None:
         return {"function": name}
     kind = type(value)
-    if not loading.is_ours(kind):
+    if not is_ours(kind):
         got = f"the function {value}" if callable(value) and hasattr(value, "__name__") else f"a {kind.__name__}"
         raise TypeError(f"{place} must be an object of jaxprt, arrays or plain values to be saved, got {got}")
     modules.add(kind.__module__)
     field = {
-        name: _describe(
-            getattr(value, name), f"{place}.{name}", arrays, modules, batched or fields.holds_models(kind, name)
-        )
-        for name in fields.names(kind)
+        name: _describe(getattr(value, name), f"{place}.{name}", arrays, modules, batched or holds_models(kind, name))
+        for name in names(kind)
     }
     try:
-        fields.check(value, batched=batched)
+        check(value, batched=batched)
     except ValueError as error:
         raise TypeError(f"{place} must be a valid {kind.__name__} to be saved and loaded again: {error}") from error
     return {"class": f"{kind.__module__}:{kind.__qualname__}", "field": field}
@@ -151,7 +547,7 @@ def _describe_array(value: Any, place: str, arrays: list) -> dict[str, Any]:
         if known is value:
             return {"array": number, "kind": kind}
     plain = np.asarray(value)
-    if plain.dtype.kind not in "biufc" and not loading.is_extended(plain.dtype):
+    if plain.dtype.kind not in "biufc" and not is_extended(plain.dtype):
         raise TypeError(f"{place} must be an array of numbers to be saved, got {plain.dtype}")
     arrays.append((value, np.ascontiguousarray(plain, plain.dtype.newbyteorder("=")).reshape(plain.shape)))
     return {"array": len(arrays) - 1, "kind": kind}

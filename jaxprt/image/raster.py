@@ -8,19 +8,22 @@ any precision.
 
 import functools
 import math
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from jaxprt import require
 from jaxprt.compile import jit, kept
-from jaxprt.image import arguments, depths
+from jaxprt.image import arguments
 from jaxprt.scene.camera import Camera, in_common_coordinates
 from jaxprt.scene.mesh import Mesh
 
+CHUNK = 1 << 13  # patches per step on CPUs
+WIDE = 1 << 18  # patches per step on GPUs, where few large steps are fastest
 FACES = (1 << 24) - 1  # largest number of triangles whose indices float32 represents exactly
 PATCH = {1: 3, 2: 4}  # edge of the square patches that triangles are cut into, in cells, by cells per pixel edge
 EDGE_ON = 1e-3  # sine of the angle between triangle and view direction below which both sides count as front
@@ -32,6 +35,94 @@ TILE = 8  # edge in cells (one per sample) of the tiles whose farthest depth cul
 # cells: to the right in even rows, to the left in odd rows, up in even columns and down in odd columns.
 SHIFT = 0.25
 SAMPLES = {1: np.zeros((1, 2)), 4: np.array([[-1, -3], [3, -1], [-3, 1], [1, 3]]) / 8}
+
+
+class Narrow(eqx.Module):
+    """Depth buffer for CPUs. It draws one pixel of all patches after another, so that data stays in the cache.
+
+    Entries are complex numbers, depth + i * triangle index. Their minimum compares real parts first and imaginary
+    parts second, so that one scatter finds both depth and index.
+    """
+
+    nearest: Complex[Array, " p"]
+
+    @staticmethod
+    def blank(count: int, dtype) -> "Narrow":
+        """Samples that show nothing."""
+        return Narrow(jnp.full(count, jax.lax.complex(jnp.array(jnp.inf, dtype), jnp.array(-1, dtype))))
+
+    @staticmethod
+    def chunk(faces: int) -> int:
+        """How many patches are drawn at once."""
+        return min(CHUNK, -(-faces // 1024) * 1024)
+
+    def depth(self, dtype) -> Float[Array, " p"]:
+        """Depths, infinite where nothing is seen."""
+        return self.nearest.real.astype(dtype)
+
+    def triangle(self) -> Int[Array, " p"]:
+        """Numbers of triangles, -1 where nothing is seen."""
+        return self.nearest.imag.astype(jnp.int32)
+
+    def drawn(self, pixel: Callable, count: int, number: Int[Array, " n"]) -> "Narrow":
+        """A buffer in which patches of some triangles have been drawn.
+
+        Args:
+            pixel: Function from the index of a pixel within a patch to the sample of this pixel in each patch, and its
+                depth.
+            count: Number of pixels of a patch.
+            number: Index of the triangle that each patch belongs to.
+        """
+
+        def one(nearest, k):
+            place, depth = pixel(k)
+            each = jax.lax.complex(depth, number.astype(depth.dtype))
+            return nearest.at[place].min(each, mode="promise_in_bounds"), None
+
+        # A scan, because XLA would otherwise recompute the values of a patch for each of its pixels.
+        return Narrow(jax.lax.scan(one, self.nearest, jnp.arange(count, dtype=jnp.int32))[0])
+
+
+class Wide(eqx.Module):
+    """Depth buffer for GPUs. It draws all pixels of many patches at once, first depths, then triangle indices.
+
+    Depths are positive, so their bits as integers have the same order, and GPUs compute the minimum of integers in
+    hardware. The methods are those of `Narrow`.
+    """
+
+    bits: Int[Array, " p"]
+    number: Int[Array, " p"]
+
+    @staticmethod
+    def blank(count: int, dtype) -> "Wide":
+        """Samples that show nothing."""
+        return Wide(_bits(jnp.full(count, jnp.inf, dtype)), jnp.full(count, -1, jnp.int32))
+
+    @staticmethod
+    def chunk(faces: int) -> int:
+        """How many patches are drawn at once."""
+        return WIDE
+
+    def depth(self, dtype) -> Float[Array, " p"]:
+        """Depths, infinite where nothing is seen."""
+        return jax.lax.bitcast_convert_type(self.bits, dtype)
+
+    def triangle(self) -> Int[Array, " p"]:
+        """Numbers of triangles, -1 where nothing is seen."""
+        return self.number
+
+    def drawn(self, pixel: Callable, count: int, number: Int[Array, " n"]) -> "Wide":
+        """A buffer in which patches of some triangles have been drawn."""
+        place, depth = jax.vmap(pixel)(jnp.arange(count, dtype=jnp.int32))
+        bits = self.bits.at[place].min(_bits(depth), mode="promise_in_bounds")
+        most = jnp.iinfo(jnp.int32).max
+        kept = jnp.where(bits < self.bits, most, self.number)  # the previous nearest triangle is hidden
+        wins = jnp.isfinite(depth) & (_bits(depth) == bits[place])
+        return Wide(bits, kept.at[place].min(jnp.where(wins, number, most), mode="promise_in_bounds"))
+
+
+def _bits(depth: Float[Array, "*n"]) -> Int[Array, "*n"]:
+    return jax.lax.bitcast_convert_type(depth, jnp.int32 if depth.dtype == jnp.float32 else jnp.int64)
 
 
 class Fragments(eqx.Module):
@@ -264,14 +355,14 @@ def _nearest(x, y, q, height: int, width: int, samples: int) -> tuple[Float[Arra
     front = area < 0  # Rows go down, so counterclockwise areas are negative. For w < 0 either order is correct.
     shape = height, width, samples
 
-    def drawn(form: type[depths.Narrow] | type[depths.Wide]):
+    def drawn(form: type[Narrow] | type[Wide]):
         nearest = form.blank(math.prod(shape), x.dtype)
         nearest = _draw(nearest, some & front, x, y, q, bounds, fine * width, fine)
         hidden = _hidden(jnp.max(nearest.depth(x.dtype).reshape(shape), -1), q, bounds, TILE // fine)
         nearest = _draw(nearest, some & ~front & ~hidden, x, y, q, bounds, fine * width, fine)
         return nearest.depth(x.dtype).reshape(shape), nearest.triangle().reshape(shape)
 
-    return jax.lax.platform_dependent(cpu=lambda: drawn(depths.Narrow), default=lambda: drawn(depths.Wide))
+    return jax.lax.platform_dependent(cpu=lambda: drawn(Narrow), default=lambda: drawn(Wide))
 
 
 def _hidden(depth: Float[Array, "h w"], q, bounds, tile: int) -> Bool[Array, " f"]:
@@ -294,7 +385,7 @@ def _hidden(depth: Float[Array, "h w"], q, bounds, tile: int) -> Bool[Array, " f
     return ahead & small & (farthest < nearest * (1 - 1e-4))
 
 
-def _draw(nearest: depths.Narrow | depths.Wide, drawn: Bool[Array, " f"], x, y, q, bounds, width: int, fine: int):
+def _draw(nearest: Narrow | Wide, drawn: Bool[Array, " f"], x, y, q, bounds, width: int, fine: int):
     """Draws some of the triangles into a depth buffer.
 
     Each triangle's bounding box is divided into patches. The patches of all triangles are drawn in order, one chunk at

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxprt.inverse import numbers, pictures, solve
+from jaxprt.inverse import pictures, solve
 from jaxprt.inverse.pictures import Pixels
 from jaxprt.inverse.solve import Fit
 
@@ -52,11 +52,11 @@ def light(
     Reference: Nocedal and Wright 2006, chapters 10 and 16.
     """
     _check(radiance, pixels)
-    first, unravel = numbers.raveled(start, steps)
+    first, unravel = solve.raveled(start, steps)
     if not (isinstance(error, float | int | np.number) and 0 < error < np.inf):
         raise ValueError(f"the error must be a positive number, got {error!r}")
-    low, high = (numbers.bound(each, start, none) for each, none in ((lower, -np.inf), (upper, np.inf)))
-    numbers.check(first, low, high)
+    low, high = (solve.bound(each, start, none) for each, none in ((lower, -np.inf), (upper, np.inf)))
+    solve.check(first, low, high)
     if prior is not None:
         _check_prior(prior, unravel, first)
 
@@ -100,13 +100,13 @@ def material(
     Reference: Madsen, Nielsen, Tingleff 2004, "Methods for non-linear least squares problems".
     """
     _check(radiance, pixels)
-    first, unravel = numbers.raveled(start, steps)
+    first, unravel = solve.raveled(start, steps)
     if len(first) > solve.DENSE:
         required = f"at most {solve.DENSE} parameters can be fitted by this method"
         raise ValueError(f"{required}, got {len(first)}: use light for more")
-    low, high = (numbers.bound(each, start, none) for each, none in ((lower, -np.inf), (upper, np.inf)))
-    numbers.check(first, low, high)
-    free, bounded, pinned = numbers.freed(first, low, high)
+    low, high = (solve.bound(each, start, none) for each, none in ((lower, -np.inf), (upper, np.inf)))
+    solve.check(first, low, high)
+    free, bounded, pinned = solve.freed(first, low, high)
 
     def function(u):
         return pictures.residual(radiance, unravel(bounded(u)), pixels)
@@ -151,16 +151,16 @@ def jointly(
         raise TypeError(f"the start must be a light and a material, a pair, got {type(start).__name__}")
     dark, made = start
     first = light(lambda each, eye: radiance(each, made, eye), dark, pixels)
-    (lit, of_light), (own, of_material) = numbers.raveled(first.value, steps), numbers.raveled(made, steps)
+    (lit, of_light), (own, of_material) = solve.raveled(first.value, steps), solve.raveled(made, steps)
     if len(lit) + len(own) > solve.DENSE:
         required = f"light and material may have at most {solve.DENSE} parameters together"
         raise ValueError(f"{required}, got {len(lit)} and {len(own)}")
-    norm, found = (float(jnp.linalg.norm(each)) for each in (numbers.raveled(dark, steps)[0], lit))
+    norm, found = (float(jnp.linalg.norm(each)) for each in (solve.raveled(dark, steps)[0], lit))
     if not (norm > 0 and found > 0):
         raise ValueError(f"the light must not be black, got norm {norm} at the start and {found} after the first fit")
-    low, high = (numbers.bound(each, made, none) for each, none in ((lower, -np.inf), (upper, np.inf)))
-    numbers.check(own, low, high)
-    free, bounded, pinned = numbers.freed(own, low, high)
+    low, high = (solve.bound(each, made, none) for each, none in ((lower, -np.inf), (upper, np.inf)))
+    solve.check(own, low, high)
+    free, bounded, pinned = solve.freed(own, low, high)
     size = norm if scale else found
 
     def whole(u: Array) -> Array:
@@ -188,7 +188,7 @@ def _check(radiance: Callable, pixels: Pixels) -> None:
         raise TypeError(f"the radiance must be a function, got {type(radiance).__name__}")
     if not isinstance(pixels, Pixels):
         raise TypeError(f"pixels must be from jaxprt.inverse.observe, got {type(pixels).__name__}")
-    numbers.outside(pixels)
+    solve.outside(pixels)
 
 
 def _check_prior(prior: Callable, unravel: Callable, first: Array) -> None:

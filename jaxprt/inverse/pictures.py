@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxprt import require
 from jaxprt.image import raster
-from jaxprt.inverse import numbers
+from jaxprt.inverse import solve
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap
@@ -118,7 +118,7 @@ def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
     if not isinstance(mesh, Mesh):
         raise TypeError(f"the mesh must be a Mesh, got {type(mesh).__name__}")
     pictures = list(pictures)
-    numbers.outside(mesh, pictures)
+    solve.outside(mesh, pictures)
     if not pictures:
         raise ValueError("at least one picture is needed, got none")
     parts = [_seen(number, mesh, each) for number, each in enumerate(pictures)]

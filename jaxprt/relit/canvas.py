@@ -13,8 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxprt.compile import jit, known, put
-from jaxprt.image.pixels import Pixels, by_color
-from jaxprt.image.skies import pixel_angle
+from jaxprt.image.pixels import Pixels, by_color, pixel_angle
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.environment import background
 from jaxprt.scene.points import Points

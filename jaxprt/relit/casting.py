@@ -13,7 +13,7 @@ from jaxprt.scene import Mesh
 from jaxprt.scene.points import Points
 from jaxprt.systems.bounces.traced import Rays
 from jaxprt.visibility import Occluder, point_starts, start_points
-from jaxprt.visibility.hits import first_fronts
+from jaxprt.visibility.rays import first_fronts
 
 _KEPT = 4  # number of scenes that are cached
 

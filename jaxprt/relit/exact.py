@@ -19,8 +19,8 @@ from threadpoolctl import threadpool_limits
 from jaxprt.brdf import Lambert
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import Between, finished
-from jaxprt.image import Pixels, front, raster, relative_l2, resolve, skies
-from jaxprt.image.layers import nearest_fragments, visible_points
+from jaxprt.image import Pixels, front, raster, relative_l2, resolve
+from jaxprt.image.pixels import nearest_fragments, pixel_angle, sky, visible_points
 from jaxprt.relit import exact_lamps
 from jaxprt.relit.channels import Shading, at_points, exact_at
 from jaxprt.scene import Camera, Environment, Mesh, Scene, environment, sides
@@ -119,7 +119,7 @@ def exact_pixels(
     pixel, weight = _chosen(shown, len(scene.parts), pixels, importance)
     triangle, barycentric, seen, owner = triangle[pixel], barycentric[pixel], seen[pixel], owner[pixel]
     way = jnp.asarray(_squares(np.asarray(raster.ray_direction(fine)))[pixel])
-    angle = _squares(skies.pixel_angle(fine))[pixel]
+    angle = _squares(pixel_angle(fine))[pixel]
     behind = np.stack([environment.sky(each, way, angle=angle) for each in environments])
     mean = np.where((owner < 0)[..., None], behind, 0).mean(2)
     lamps = exact_lamps.Lamps.of(scene, shadings)
@@ -211,7 +211,7 @@ def exact_picture(
             value = _sum(shading.mesh, brdf, lights, points, **options)
             value = value + lamps.at_points(shading.mesh, brdf, points, jnp.asarray(camera.eye))
         color[:, index] = value if emitted is None else value + emitted
-    behind = [skies.sky(each, camera) for each in environments]
+    behind = [sky(each, camera) for each in environments]
     pictures = [resolve(shown.pixels, a, background=b) for a, b in zip(color, behind, strict=True)]
     if (camera.width, camera.height) != (asked.width, asked.height):
         asked = dataclasses.replace(asked, width=camera.width, height=camera.height)

@@ -19,8 +19,8 @@ from jaxprt.scene.mesh import split
 from jaxprt.scene.points import Points, placed
 from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.lamps.places import at_points, places
-from jaxprt.visibility import lamp_rays, texel_rays
-from jaxprt.visibility.lamp_rays import LampPlaces
+from jaxprt.visibility import picture_rays
+from jaxprt.visibility.picture_rays import LampPlaces
 
 # Pieces of a lamp, for groups with a part of a higher curvature of radiance, such as gray plastic of roughness .3 or
 # metal of .5, and for others.
@@ -84,10 +84,10 @@ class LampLight:
         pixel = np.asarray(self.pixels.pixel)[own]
         triangle = np.where(index < 0, -1, np.asarray(self.pixels.triangle)[own])
         barycentric, slope = (np.asarray(each)[own] for each in (self.pixels.barycentric, self.pixels.slope))
-        points = texel_rays.PicturePoints(triangle, barycentric, slope, pixel // self.width, pixel % self.width)
+        points = picture_rays.PicturePoints(triangle, barycentric, slope, pixel // self.width, pixel % self.width)
         fields = np.asarray(position), np.asarray(frame)[:, 2]
         own_places = self._places_for(number)
-        moment = lamp_rays.moments(self._caster.occluder, self._caster.mesh, points, *fields, own_places)
+        moment = picture_rays.moments(self._caster.occluder, self._caster.mesh, points, *fields, own_places)
         return at_points(moment, position, frame, self._sources, own_places.pieces)
 
 

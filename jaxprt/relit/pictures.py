@@ -16,8 +16,7 @@ from jaxtyping import Array, Float, Int
 from jaxprt import require
 from jaxprt.compile import Between, compile_time, finished, jit, known, promoted, put
 from jaxprt.image import raster
-from jaxprt.image.layers import visible_points
-from jaxprt.image.pixels import Pixels
+from jaxprt.image.pixels import Pixels, visible_points
 from jaxprt.relit import canvas, interpolation, lamplight, shadows, tracing
 from jaxprt.relit.casting import caster
 from jaxprt.relit.groups import Arriving, Stage, Surface, look_at, sampled

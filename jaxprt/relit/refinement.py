@@ -15,7 +15,7 @@ from jaxprt.files import objects
 from jaxprt.relit import shadows
 from jaxprt.scene import Camera, Environment, Mesh, Scene, subdivision
 from jaxprt.scene.subdivision import Division
-from jaxprt.visibility import blocks, refinement, shown
+from jaxprt.visibility import blocks, refinement
 from jaxprt.visibility.occluder import check
 
 ERROR = 0.015  # of pictures, by default
@@ -180,4 +180,4 @@ def interpolation_error(scene: Scene) -> float:
 
 def _views(scene: Scene, mesh: Mesh) -> list[Camera]:
     check(mesh, "mesh of the scene")
-    return shown.cameras(mesh, scene.cameras, [part.mesh for part in scene.parts])
+    return refinement.cameras(mesh, scene.cameras, [part.mesh for part in scene.parts])

@@ -13,8 +13,7 @@ from jaxprt.relit.channels import Shading
 from jaxprt.relit.groups import Place, joined_mesh
 from jaxprt.relit.recipes import Target, harmonic_table, lobe_table
 from jaxprt.scene import Environment, Mesh, PointLight
-from jaxprt.scene.mesh import frames
-from jaxprt.scene.opacity import Opacity
+from jaxprt.scene.mesh import Opacity, frames
 from jaxprt.systems import bounces, lamps
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart, traced
 from jaxprt.systems.bounces.jobs import DEGREE

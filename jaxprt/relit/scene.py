@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jaxprt import require
 from jaxprt.brdf import BlinnPhong, grid
 from jaxprt.compile import Between, compile_time, known, promoted, put
-from jaxprt.image import automatic_exposure, layers, raster
+from jaxprt.image import automatic_exposure, pixels, raster
 from jaxprt.relit import channels, groups, interpolation, measuring, pictures, reflection, tracing
 from jaxprt.relit import lamps as scene_lamps
 from jaxprt.relit.casting import caster
@@ -535,7 +535,7 @@ class RelitScene(System):
         hidden = groups.faces_of(self.mesh, np.repeat(backs, self.place.counts)) if backs.any() else None
         occluder = None if self.mesh.opacity is None else caster(self.mesh).occluder
         options = {"samples": samples, "hidden": hidden, "occluder": occluder}
-        return layers.coverage(self.drawn, camera.local(self.mesh.origin), **options)
+        return pixels.coverage(self.drawn, camera.local(self.mesh.origin), **options)
 
     @promoted
     def exposure(self, picture: Float[Array, "h w c"], camera: Camera | None = None) -> Float[Array, ""]:

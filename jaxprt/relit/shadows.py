@@ -25,7 +25,7 @@ from jaxprt.scene import environment as environments
 from jaxprt.scene.panorama import Panorama
 from jaxprt.sphere import cubemap
 from jaxprt.systems import bright_texels
-from jaxprt.visibility import texel_rays
+from jaxprt.visibility import picture_rays
 
 TEXELS = 16  # number of traced texels
 _RANK = 2 * TEXELS  # What exceeds the flux of so many texels is traced; the systems sum about as many texels again.
@@ -98,11 +98,11 @@ def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, k
     bright = np.flatnonzero(flux > 0)
     if not len(bright):
         return None
-    count = np.clip(1 + np.round(_MORE * flux[bright] / flux.sum()).astype(int), 1, texel_rays.PLACES)
+    count = np.clip(1 + np.round(_MORE * flux[bright] / flux.sum()).astype(int), 1, picture_rays.PLACES)
     fine = _finer(environment)
-    direction = light_samples.in_texels(number[bright], fine, size=size, count=texel_rays.PLACES)
+    direction = light_samples.in_texels(number[bright], fine, size=size, count=picture_rays.PLACES)
     share = np.zeros((len(number), len(pixels.triangle)), np.uint8)
-    rays = texel_rays.TexelRays(direction, count)
+    rays = picture_rays.TexelRays(direction, count)
     share[bright] = _shares(mesh, pixels, width, number[bright], rays) if keep else _cast(mesh, pixels, width, rays)
     place = light_samples.places_in_texels(number, fine, size=size)
     return TracedLight(rest, excess, TexelShares(texel, share, put(place.astype(environment.radiance.dtype))))
@@ -129,11 +129,11 @@ def _finer(light: Environment) -> Float[np.ndarray, "6 m m c"]:
     return _FINER[panorama]
 
 
-def _cast(mesh: Mesh, pixels: Pixels, width: int, rays: texel_rays.TexelRays) -> UInt8[np.ndarray, "t p"]:
+def _cast(mesh: Mesh, pixels: Pixels, width: int, rays: picture_rays.TexelRays) -> UInt8[np.ndarray, "t p"]:
     pixel = np.asarray(pixels.pixel)
     triangle, barycentric, slope = (np.asarray(field) for field in (pixels.triangle, pixels.barycentric, pixels.slope))
-    points = texel_rays.PicturePoints(triangle, barycentric, slope, pixel // width, pixel % width)
-    return texel_rays.shares(mesh, caster(mesh).occluder, points, rays)
+    points = picture_rays.PicturePoints(triangle, barycentric, slope, pixel // width, pixel % width)
+    return picture_rays.shares(mesh, caster(mesh).occluder, points, rays)
 
 
 # For each view, the traced texels: number of rays, a direction of each, and the shares.
@@ -142,7 +142,7 @@ _LOCK = threading.Lock()
 
 
 def _shares(
-    mesh: Mesh, pixels: Pixels, width: int, texel: Int[np.ndarray, " t"], rays: texel_rays.TexelRays
+    mesh: Mesh, pixels: Pixels, width: int, texel: Int[np.ndarray, " t"], rays: picture_rays.TexelRays
 ) -> UInt8[np.ndarray, "t p"]:
     """The shares of texels, of which only those are traced that were not traced before."""
     rows = _rows_of(pixels.triangle)
@@ -155,7 +155,7 @@ def _shares(
         else:
             share[number] = before[2]
     if new:
-        share[new] = _cast(mesh, pixels, width, texel_rays.TexelRays(rays.direction[new], rays.per_texel[new]))
+        share[new] = _cast(mesh, pixels, width, picture_rays.TexelRays(rays.direction[new], rays.per_texel[new]))
     with _LOCK:
         for number in new:
             rows[int(texel[number])] = int(rays.per_texel[number]), rays.direction[number], share[number]

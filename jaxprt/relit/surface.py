@@ -20,7 +20,7 @@ from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.lamps.relight import summed
 from jaxprt.systems.lobe import widened
 from jaxprt.systems.protocol import Blend
-from jaxprt.visibility import texel_rays
+from jaxprt.visibility import picture_rays
 
 
 class Sight(eqx.Module):
@@ -182,7 +182,7 @@ def from_texels(
         size: Edge of the cubemap faces in texels.
         samples: Number of sample points along the edge of each texel.
     """
-    light = texel, excess / texel_rays.FULL, share
+    light = texel, excess / picture_rays.FULL, share
     options = {"size": size, "samples": samples, "place": place}
     return bright_texels.sent(
         surface.brdf, sight.frame, sight.wo, light, None, sight.blend, above=sight.above, **options

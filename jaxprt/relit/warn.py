@@ -16,7 +16,7 @@ from jaxprt.scene import Camera, Mesh, Part, Scene, TexturedMaterial
 from jaxprt.scene.camera import localized
 from jaxprt.scene.mesh import bounds
 from jaxprt.visibility import Occluder
-from jaxprt.visibility.hits import front
+from jaxprt.visibility.rays import hits_front
 
 _RAYS = 64  # along an edge of the picture
 _SMALLEST = 0.01  # share of the picture's rays that a part must meet: at silhouettes, normals may face away
@@ -42,7 +42,7 @@ def of_backs(scene: Scene, mesh: Mesh, camera: Camera) -> None:
     triangle, *_ = occluder.hit(np.tile(np.asarray(near.eye, np.float32), (len(way), 1)), way)
     met = np.flatnonzero(triangle >= 0)
     corner = occluder.facing(triangle[met], way[met])
-    away = ~front(occluder, np.asarray(mesh.normal), corner, way[met])
+    away = ~hits_front(occluder, np.asarray(mesh.normal), corner, way[met])
     own = np.asarray(mesh.region)[corner[:, 0]]
     shells = enclosing(scene)
     for number, part in enumerate(scene.parts):

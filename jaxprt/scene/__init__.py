@@ -5,16 +5,14 @@ from jaxprt.scene import light_probes as light_probes
 from jaxprt.scene import light_samples as light_samples
 from jaxprt.scene import material as material
 from jaxprt.scene import subdivision as subdivision
-from jaxprt.scene import suns as suns
 from jaxprt.scene import texture as texture
 from jaxprt.scene.camera import Camera
-from jaxprt.scene.environment import Environment, load_environment
+from jaxprt.scene.environment import Environment, Sun, load_environment, with_suns
 from jaxprt.scene.formats.scene_file import load_mesh, load_scene
 from jaxprt.scene.light_probes import irradiance, light_probe
 from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.scene import Part, PointLight, Scene
-from jaxprt.scene.suns import Sun, with_suns
 
 __all__ = [
     "Camera",

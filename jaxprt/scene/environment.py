@@ -1,22 +1,23 @@
-"""Environment maps: distant light on a cubemap. Loading, resampling, rotation and lookup."""
+"""Distant light on a cubemap: environment maps, their loading, resampling, rotation and lookup, and suns."""
 
 import functools
 import pathlib
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Float64
 
 from jaxprt import require
 from jaxprt.compile import jit, known, put
 from jaxprt.files import images
-from jaxprt.scene import panorama, resampling
+from jaxprt.scene import panorama
 from jaxprt.scene.panorama import Panorama
 from jaxprt.sphere import cubemap
 
@@ -35,6 +36,160 @@ _AROUND = 4096  # smallest number of parts around the horizon into which a latlo
 _CHUNK = 2**20  # pixels that are checked per step
 LAYOUTS = ("latlong", "openexr-latlong", *_CUBES)
 _STATED = {"latlong": "openexr-latlong", "cube": "openexr-cube"}  # values of the EXR attribute envmap
+_PARTS = 8  # A pixel is divided into at most this many parts per direction; larger pixels are subdivided first.
+_PARTS_AT_ONCE = 2**20  # parts of pixels per step
+
+
+def _resampling_bytes(shape: tuple[int, ...], size: int, *, faces_down: int | None, around: int) -> int:
+    """Memory that resampling takes besides the picture, and the light in float32 that is made of the result.
+
+    Args:
+        shape: Rows, columns and channels of the picture.
+        size: Texels along the edge of a cube face.
+        faces_down: Faces of a cube layout from top to bottom; None for latlong pictures.
+        around: Smallest number of parts around the horizon.
+
+    Returns:
+        An upper bound in bytes.
+    """
+    height, width, channels = shape
+    texels = 6 * size**2
+    # The mean radiance and two temporary arrays of one channel in float64, and the light in float32.
+    needed = texels * (8 * (channels + 3) + 8 * channels)
+    if faces_down:  # the faces, and where their pixels are cut by texels
+        return needed + 8 * height * width * channels + 5 * 8 * (size + height // faces_down) ** 2
+    # Some twelve arrays of the parts in one row of pixels, or in a step.
+    return needed + 12 * 8 * max(_PARTS * max(2 * width, 12 * size * 7, around), _PARTS_AT_ONCE)
+
+
+def _box_edges(count: int, *, on_edge: bool) -> np.ndarray:
+    """Edges of the boxes around equidistant samples on [-1, 1].
+
+    Args:
+        count: Number of samples.
+        on_edge: Whether the outer samples are at the ends, where their boxes are half as large.
+
+    Returns:
+        The edges, ascending, one more than samples.
+    """
+    if not on_edge or count == 1:
+        return np.linspace(-1, 1, count + 1)
+    return np.clip((2 * np.arange(count + 1) - 1) / (count - 1) - 1, -1, 1)
+
+
+def _means_of_cube(face: np.ndarray, edge: np.ndarray, size: int) -> Float64[np.ndarray, "6 n n c"]:
+    """Exact area means of a cube: pixels, texels and their overlaps are all rectangles on a face.
+
+    Args:
+        face: Pixels of the six faces, [6, m, m, c], in OpenGL's orientation.
+        edge: Edges of the pixels on [-1, 1], the same for rows and columns.
+        size: Texels along the edge of a face.
+
+    Returns:
+        Mean radiance of each texel.
+    """
+    texel_edge = np.linspace(-1, 1, size + 1)
+    cut = np.union1d(edge, texel_edge)
+    pixel = np.searchsorted(edge, (cut[1:] + cut[:-1]) / 2) - 1
+    start = np.searchsorted(cut, texel_edge[:-1])
+    weight = _solid_angle(cut)
+
+    def total(value):
+        return np.add.reduceat(np.add.reduceat(value, start, axis=0), start, axis=1)
+
+    area = total(weight)
+    result = np.empty((6, size, size, face.shape[-1]))
+    for f in range(6):
+        for c in range(face.shape[-1]):
+            result[f, :, :, c] = total(face[f, :, :, c][np.ix_(pixel, pixel)] * weight) / area
+    return result
+
+
+def _means_of_latlong(
+    image: np.ndarray, latitude: np.ndarray, longitude: np.ndarray, size: int, *, around: int
+) -> Float64[np.ndarray, "6 n n c"]:
+    """Area means of a latlong picture: small parts of the pixels are distributed to the texels.
+
+    Args:
+        image: Radiance, [h, w, c].
+        latitude: Edges of the rows, descending.
+        longitude: Edges of the columns, descending.
+        size: Texels along the edge of a cube face.
+        around: Smallest number of parts around the horizon.
+
+    Returns:
+        Mean radiance of each texel. The integral over the sphere is that of the picture.
+    """
+    # A texel is at least 2 / (3 size) wide, in the corners of a face. About eight parts should fall across it.
+    around = max(int(np.ceil(12 * size * 2 * np.pi)), around)
+    parts = [max(2, int(np.ceil(around / count))) for count in (2 * image.shape[0], image.shape[1])]
+    repeat = [-(-count // _PARTS) for count in parts]
+    pixel_row, pixel_column = (
+        np.arange(count).repeat(times) for count, times in zip(image.shape[:2], repeat, strict=True)
+    )
+    rows, columns = (-(-count // times) for count, times in zip(parts, repeat, strict=True))
+    latitude = _subdivide(_subdivide(latitude, repeat[0]), rows).reshape(-1)
+    longitude = _subdivide(_subdivide(longitude, repeat[1]), columns).reshape(-1)
+
+    # Axes: rows of pixels, rows of parts, columns of pixels, columns of parts. The samples of a pixel lie on a
+    # sheared lattice: on a regular one, all samples along a texel's edge would fall on the same side of it.
+    height, width = (
+        -np.diff(np.sin(latitude)).reshape(-1, rows, 1, 1),
+        -np.diff(longitude).reshape(-1, columns),
+    )
+    across, down = (np.arange(columns) + 0.5) / columns, (np.arange(rows)[:, None, None] + 0.5) / rows
+    latitude = latitude[:-1].reshape(-1, rows, 1, 1) + np.diff(latitude).reshape(-1, rows, 1, 1) * across
+    longitude = longitude[:-1].reshape(-1, columns) - width * down
+
+    flux, weight = np.zeros((image.shape[-1], 6 * size**2)), np.zeros(6 * size**2)
+    step = max(1, _PARTS_AT_ONCE // (width.size * rows))
+    for first in range(0, len(pixel_row), step):
+        row = slice(first, first + step)
+        index = _texel_index(latitude[row], longitude, size).ravel()
+        area = height[row] * width
+        weight += np.bincount(index, area.ravel(), minlength=weight.size)
+        for c in range(len(flux)):
+            radiance = image[pixel_row[row], :, c][:, pixel_column]
+            flux[c] += np.bincount(index, (radiance[:, None, :, None] * area).ravel(), minlength=weight.size)
+    before = flux.sum(axis=1)
+    mean = np.divide(flux, weight, out=flux).reshape(-1, 6, size, size)
+
+    # Parts approximate the texels' areas. The resulting change of the integral, about 0.1 %, is spread over the sphere.
+    solid_angle = _solid_angle(np.linspace(-1, 1, size + 1))
+    after = np.array([(color * solid_angle).sum() for color in mean])
+    scale = np.divide(before, after, out=np.ones_like(before), where=after != 0)
+    mean *= scale[:, None, None, None]
+    return np.moveaxis(mean, 0, -1)
+
+
+def _solid_angle(edge: np.ndarray) -> np.ndarray:
+    """Solid angles of the rectangles of a grid on a face, given its lines, which are the same for rows and columns."""
+    corner = np.arctan2(edge[:, None] * edge, np.sqrt(1 + edge[:, None] ** 2 + edge**2))
+    return np.diff(np.diff(corner, axis=0), axis=1)
+
+
+def _subdivide(edge: np.ndarray, parts: int) -> np.ndarray:
+    """Divides every interval into equal parts."""
+    fraction = np.arange(parts) / parts
+    inner = edge[:-1, None] * (1 - fraction) + edge[1:, None] * fraction
+    return np.append(inner.ravel(), edge[-1])
+
+
+def _texel_index(latitude: np.ndarray, longitude: np.ndarray, size: int) -> np.ndarray:
+    """Flat indices of the texels at given latitudes and longitudes, which are broadcast."""
+    # On the four side faces, each spans a quarter turn and the column depends only on the longitude.
+    turn = np.round(longitude / (np.pi / 2)).astype(int)
+    offset = longitude - turn * (np.pi / 2)
+    side = np.array([4, 0, 5, 1])[turn % 4]  # +z, +x, -z, -x
+    height = np.tan(latitude)
+    row = -height / np.cos(offset)
+    cap = np.abs(row) > 1
+    flat = 1 / height
+    column = np.where(cap, np.sin(longitude) * np.abs(flat), np.tan(offset))
+    row = np.where(cap, np.cos(longitude) * flat, row)
+    face = np.where(cap, np.where(height > 0, 2, 3), side)
+    i, j = (np.clip((size / 2 * (x + 1)).astype(int), 0, size - 1) for x in (row, column))
+    return (face * size + i) * size + j
 
 
 class Environment(eqx.Module):
@@ -198,10 +353,10 @@ def resample(
     _check_size(image.shape, layout, size)
     if layout in _CUBES:
         face = _cut_faces(image, layout)
-        return resampling.from_cube(face, resampling.box_edge(face.shape[1], on_edge=layout == "openexr-cube"), size)
+        return _means_of_cube(face, _box_edges(face.shape[1], on_edge=layout == "openexr-cube"), size)
     on_edge = layout == "openexr-latlong"
-    latitude, longitude = (-resampling.box_edge(count, on_edge=on_edge) for count in image.shape[:2])
-    return resampling.from_latlong(image, np.pi / 2 * latitude, np.pi * longitude, size, around=_AROUND)
+    latitude, longitude = (-_box_edges(count, on_edge=on_edge) for count in image.shape[:2])
+    return _means_of_latlong(image, np.pi / 2 * latitude, np.pi * longitude, size, around=_AROUND)
 
 
 def _environment(value: object) -> None:
@@ -454,7 +609,7 @@ def _check_size(shape: tuple[int, ...], layout: str, size: int) -> None:
     """Refuses sizes below 1, and cubemaps that do not fit into memory, before anything is made."""
     require.count("size", size, least=1)
     rows = _CUBES[layout][0][0] if layout in _CUBES else None
-    needed = resampling.bytes_needed(shape, int(size), faces_down=rows, around=_AROUND)
+    needed = _resampling_bytes(shape, int(size), faces_down=rows, around=_AROUND)
     require.memory(f"a cubemap of 6 x {size} x {size} texels", needed, "choose a smaller size")
 
 
@@ -489,3 +644,87 @@ def _cut_faces(image: np.ndarray, layout: str) -> np.ndarray:
     n = image.shape[0] // rows
     cut = [image[i * n : (i + 1) * n, j * n : (j + 1) * n] for i, j in corners]
     return np.stack([face[::down, ::right] for face, (down, right) in zip(cut, steps, strict=True)])
+
+
+def _three(value: Any) -> Any:
+    """A number or three numbers as an array of shape [3]. What is not of numbers is left for the class to refuse."""
+    value = require.floating(value, dtype=jnp.result_type(float))
+    return jnp.broadcast_to(value, (3,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
+
+
+class Sun(eqx.Module):
+    """A distant light of one direction, such as a directional light of a glTF file.
+
+    Attributes:
+        name: Name of the light.
+        direction: Direction from the scene towards the light, in world coordinates, of any length.
+        irradiance: Irradiance of a surface that faces the light, in units of radiance times steradian.
+
+    Raises:
+        TypeError: The name is not a string.
+        ValueError: The direction or the irradiance is not finite or of another shape, the direction is zero, or the
+            irradiance is negative.
+    """
+
+    name: str = eqx.field(static=True)
+    direction: Float[Array, "3"] = eqx.field(converter=require.floating)
+    irradiance: Float[Array, "3"] = eqx.field(converter=_three, default=1.0)
+
+    def __check_init__(self):
+        """Refuses values that are not finite, and directions of no length."""
+        if not isinstance(self.name, str):
+            raise TypeError(f"the name of a sun must be text, got {self.name!r}")
+        require.finite(f"the direction of sun {self.name!r}", self.direction)
+        require.at_least(f"the irradiance of sun {self.name!r}", self.irradiance, 0.0)
+        for name in ("direction", "irradiance"):
+            shape = list(jnp.shape(getattr(self, name)))
+            if shape != [3]:
+                raise ValueError(f"the {name} of sun {self.name!r} must be three numbers, got an array {shape}")
+        if not isinstance(self.direction, Tracer) and not self.direction.any():
+            raise ValueError(f"the direction of sun {self.name!r} must not be zero, got {self.direction}")
+
+
+def _light(value: Any) -> None:
+    require.kind("the light", value, Environment, source="jaxprt.load_environment")
+
+
+def _suns(value: Any) -> tuple[Sun, ...]:
+    if not isinstance(value, Sequence) or isinstance(value, str | bytes):
+        raise TypeError(f"suns must be a list of suns, got {require.shown(value)}")
+    for sun in value:
+        require.kind("each of the suns", sun, Sun, source="jaxprt.scene.Sun")
+    return tuple(value)
+
+
+@require.arguments(light=_light, suns=_suns)
+@jit
+def with_suns(light: Environment, suns: Sequence[Sun]) -> Environment:
+    """Adds suns to distant light: each fills one texel, whose flux is the sun's irradiance.
+
+    A texel of 6 x 64 x 64 has a width of 1.4 degrees, which is 2.6 times that of the sun in the sky. The result is
+    linear in the light and in the irradiances. It does not change as a direction moves within a texel, so its
+    gradient by directions is zero.
+
+    Args:
+        light: One light, or a batch of them, in three colors or in one. One color becomes three.
+        suns: The suns, such as `suns` of a scene; may be empty.
+
+    Returns:
+        The light with the suns, in three colors.
+
+    Raises:
+        TypeError: The light is not an `Environment`, or `suns` is not a list of suns.
+        ValueError: The light has another number of colors than one and three.
+    """
+    radiance = light.radiance
+    if radiance.shape[-1] not in (1, 3):
+        raise ValueError(f"the light must have one color or three for suns, got {radiance.shape[-1]}")
+    radiance = jnp.broadcast_to(radiance, (*radiance.shape[:-1], 3))
+    size = radiance.shape[-2]
+    area = cubemap.solid_angle(size=size).astype(radiance.dtype)
+    for sun in suns:
+        face, place = cubemap.coordinates(jax.lax.stop_gradient(sun.direction))
+        column, row = (jnp.clip(jnp.floor((place[i] + 1) / 2 * size), 0, size - 1).astype(jnp.int32) for i in (0, 1))
+        value = sun.irradiance.astype(radiance.dtype) / area[face, row, column]
+        radiance = radiance.at[..., face, row, column, :].add(value)
+    return Environment(radiance)

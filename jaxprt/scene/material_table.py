@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxprt.brdf import BlinnPhong, MetallicRoughness, sheen
 from jaxprt.compile import kept, known, put, shared_size
-from jaxprt.scene import mipmap, normal_maps, texture
+from jaxprt.scene import texture
 from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.points import Points
 from jaxprt.scene.scene import Part
@@ -209,9 +209,9 @@ def _looked(table: MaterialTable, points: Points) -> Look:
     normal = None
     if table.frame is not None:
         normal, variance = _normals(table, points)
-        values = values._replace(roughness=normal_maps.rougher(values.roughness, variance))
+        values = values._replace(roughness=texture.widen_roughness(values.roughness, variance))
         layers = layers and layers._replace(
-            clearcoat_roughness=normal_maps.rougher(layers.clearcoat_roughness, variance)
+            clearcoat_roughness=texture.widen_roughness(layers.clearcoat_roughness, variance)
         )
     shiny = table.factor[:, _SHINY][table.part[points.corner[0]]] > 0
     none = jnp.zeros_like(values.base_color)
@@ -282,11 +282,11 @@ def _normals(table: MaterialTable, points: Points) -> tuple[Float[Array, "p 3"],
     coordinate, slope = _coordinates(table, points)
     place = coordinate, slope
     mean = 2 * _read(table, points, place, _NORMAL) - 1
-    normal = normal_maps.tilted(frame, jnp.where(base[:, 6] < 0, -1, 1), mean, scale)
+    normal = texture.tilt_normals(frame, jnp.where(base[:, 6] < 0, -1, 1), mean, scale)
     _, moving = _in_image(table, part, place, _NORMAL)
     shape = table.texels.shape[jnp.maximum(table.image[part, _NORMAL], 0)]
     footprint = SHARPER * jnp.sqrt(jnp.max(jnp.sum((moving * shape[:, ::-1]) ** 2, -1), 0))
-    variance = normal_maps.variance(mean, scale, jax.lax.stop_gradient(footprint))
+    variance = texture.normal_variance(mean, scale, jax.lax.stop_gradient(footprint))
     return jnp.where(has[:, None], normal, frame[:, 2]), jnp.where(has, variance, 0)
 
 
@@ -569,8 +569,8 @@ def _texels(images: Mapping[tuple[int, bool], Any], dtype: Any, least: Texels | 
     start, shape, channels = np.full((rows, _LEVELS), -1), np.ones((rows, 2), np.int32), np.ones(rows, np.int32)
     start[:, 0], values, total = 0, [], 0
     for row, ((_, normals), image) in enumerate(images.items()):
-        image = normal_maps.of_unit_length(image) if normals else image
-        for level, own in enumerate(mipmap.levels(image)):
+        image = texture.unit_normals(image) if normals else image
+        for level, own in enumerate(texture.mipmap(image)):
             start[row, level] = total
             total += own.size
             values.append(own.reshape(-1))

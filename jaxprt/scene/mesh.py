@@ -1,28 +1,213 @@
 """Triangle meshes: construction from files and arrays, joining, splitting, rotation, and a ground plane."""
 
 import dataclasses
+import math
 import pathlib
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int, Integer
+from jaxtyping import Array, Bool, Float, Int, Integer
 
 from jaxprt import require
-from jaxprt.scene import mesh_arrays
 from jaxprt.scene import origin as origins
 from jaxprt.scene.formats.geometry import Geometry, rows_of
-from jaxprt.scene.normals import vertex_normals
-from jaxprt.scene.opacity import Opacity
 from jaxprt.sphere import directions
 
+BLEND = -1.0  # in place of a cutoff, for surfaces that stop the share alpha
+CLEAR = 1 / 512  # share of light that no 8-bit image resolves: less is nothing, and all but this is everything
+# Axes after the first of each field of a mesh, and whether it holds integers.
+_FIELDS = {
+    "position": ((3,), False),
+    "face": ((3,), True),
+    "normal": ((3,), False),
+    "tangent": ((3,), False),
+    "region": ((), True),
+    "texture": ((2,), False),
+}
+_WRONG = float, complex, str, bytes, list, tuple, dict, set
+_CREASE = np.cos(np.radians(40))  # smallest cosine between a shared normal and that of each split vertex
 _GAP = 5e-4  # gap above the ground, relative to the diagonal; larger than the offset of ray origins
 _BLOCK = 8192
 _DENSE = 0.4  # spacing of the ground's vertices at its center, relative to that of a uniform grid
+
+
+class Opacity(eqx.Module):
+    """Opacity of the vertices of a mesh, and the images that multiply it.
+
+    The opacity of a point is interpolated between the vertices and multiplied by the texel. All arrays are in NumPy.
+
+    Attributes:
+        coordinate: Where each vertex lies in its image; v points up.
+        factor: Opacity of each vertex, without its image.
+        layer: Row of each vertex in the fields below; row 0 is opaque.
+        cutoff: Opacity from which on the surface is there; `BLEND` for surfaces that stop this share of light.
+        wrap: Wrap mode of the image along u and v, as an index into `texture.WRAPS`.
+        start: Index of the image's first texel; -1 without an image.
+        shape: Height and width of the image.
+        texel: The texels of all images, row by row, first row on top.
+        passing: Color of the light that passes each layer, relative to its mean: 1 for alpha, a tint for glass.
+        glass: Whether a layer lets light through without being reflected less, as glass does and holes do not.
+    """
+
+    coordinate: Float[Array | np.ndarray, "v 2"]
+    factor: Float[Array | np.ndarray, " v"]
+    layer: Int[Array | np.ndarray, " v"]
+    cutoff: Float[Array | np.ndarray, " m"]
+    wrap: Int[Array | np.ndarray, "m 2"]
+    start: Int[Array | np.ndarray, " m"]
+    shape: Int[Array | np.ndarray, "m 2"]
+    texel: Float[Array | np.ndarray, " t"]
+    passing: Float[Array | np.ndarray, "m 3"]
+    glass: Bool[Array | np.ndarray, " m"]
+
+    @property
+    def blends(self) -> bool:
+        """Whether some surfaces stop a share of the light."""
+        return bool(np.any(np.asarray(self.cutoff) == BLEND))
+
+
+def _as_array(value: Any) -> Any:
+    """NumPy arrays and lists of real numbers as JAX arrays, in float32 and int32 unless float64 is enabled."""
+    if isinstance(value, jax.Array) or not isinstance(value, np.ndarray | list | tuple):
+        return value
+    if require.unreal(value):
+        return value
+    known = np.asarray(value)
+    if jnp.issubdtype(known.dtype, jnp.floating):
+        return require.floating(value)
+    return jax.device_put(known.astype(np.int32)) if np.all(np.abs(known) < 2**31) else value
+
+
+def _check_shapes(mesh: Any) -> None:
+    """Refuses a mesh whose arrays have other types than its fields, or other lengths than its positions.
+
+    Placeholders such as the axes of `jax.vmap` pass. Values are not looked at.
+
+    Raises:
+        TypeError: An array has a wrong type.
+        ValueError: An array has a wrong shape.
+    """
+    origin = mesh.origin
+    if (
+        not isinstance(origin, tuple)
+        or len(origin) != 3
+        or not all(type(x) is float and math.isfinite(x) for x in origin)
+    ):
+        got = require.shown(origin)
+        raise ValueError(f"origin of a mesh must be a tuple of three finite numbers of class float, got {got}")
+    for name, (width, whole) in _FIELDS.items():
+        value = getattr(mesh, name)
+        if not isinstance(value, jax.Array | np.ndarray):
+            if isinstance(value, _WRONG):
+                raise TypeError(
+                    f"{name} of a mesh must be an array of numbers, got one of class {type(value).__name__}"
+                )
+            continue
+        require.real(f"{name} of a mesh", value)
+        if not jnp.issubdtype(value.dtype, jnp.integer if whole else jnp.floating):
+            kind = "integers" if whole else "real numbers"
+            raise TypeError(f"{name} of a mesh must be {kind}, got {value.dtype}: `make_mesh` converts lists")
+        rows = None if name in ("face", "position") else np.shape(mesh.position)[:1]
+        shape = value.shape
+        if shape[1:] != width or not shape or (rows and shape[:1] != rows):
+            count = "any" if not rows else rows[0]
+            required = ", ".join(map(str, (count, *width)))
+            raise ValueError(f"{name} of a mesh must be [{required}], got {list(shape)}")
+
+
+def check_mesh(value: Any) -> None:
+    """Refuses anything but a mesh.
+
+    Raises:
+        TypeError: The value has not the fields of a mesh.
+    """
+    if not all(hasattr(value, field) for field in _FIELDS):
+        source = "jaxprt.scene.mesh.make_mesh or jaxprt.load_mesh"
+        raise TypeError(f"the mesh must be of class Mesh, which {source} makes, got {require.shown(value)}")
+
+
+def _check_meshes(value: Any) -> None:
+    """Refuses anything but a list of meshes, by TypeError."""
+    if not isinstance(value, list | tuple):
+        raise TypeError(f"meshes must be a list of meshes, got {require.shown(value)}")
+    for mesh in value:
+        check_mesh(mesh)
+
+
+def check_kinds(mesh: Any, name: str) -> None:
+    """Refuses a mesh with fields that are not arrays, which only placeholders are.
+
+    Raises:
+        TypeError: There is such a field.
+    """
+    for field in _FIELDS:
+        value = getattr(mesh, field)
+        if value is not None or field != "texture":
+            require.array(f"{field} of {name}", value, "v", "v _")
+
+
+def check_values(mesh: Any, name: str) -> None:
+    """Refuses a mesh with values that are not finite, or faces that refer to missing vertices.
+
+    Raises:
+        ValueError: There are such values. Inside `jax.jit` they are not known and not checked.
+    """
+    check_kinds(mesh, name)
+    for field in _FIELDS:
+        value = getattr(mesh, field)
+        if value is not None:
+            require.finite(f"{field} of {name}", value)
+    if len(mesh.face) and len(mesh.position):
+        require.within(f"faces of {name}", mesh.face, 0, len(mesh.position) - 1)
+    if len(mesh.region):
+        require.within(f"regions of {name}", mesh.region, 0, 2**31 - 1)
+
+
+def vertex_normals(
+    position: Float[np.ndarray, "v 3"], face: Integer[np.ndarray, "f 3"], welded: bool
+) -> Float[np.ndarray, "v 3"]:
+    """Unit normals: means of face normals, weighted by their angles at the vertex.
+
+    Args:
+        position: Positions of the vertices, in float64.
+        face: Vertex indices of each triangle.
+        welded: Whether vertices at one position share such a mean, unless they form a crease.
+    """
+    corner = position[face]
+    edge = np.roll(corner, -1, 1) - corner
+    cross = np.cross(edge[:, 0], edge[:, 1])
+    area = np.linalg.norm(cross, axis=1)
+    # The normal of a face thinner than the resolution of float32 is only rounding error.
+    thickness = 2 * np.spacing(np.abs(corner).max((1, 2)).astype(np.float32)).astype(np.float64)
+    thin = area <= thickness * np.linalg.norm(edge, axis=2).max(1)
+    unit = cross / np.where(area > 0, area, 1)[:, None]
+    angle = np.arctan2(area[:, None], -(edge * np.roll(edge, 1, 1)).sum(2))
+    weighted = (np.where(thin[:, None], 0, angle)[:, :, None] * unit[:, None]).reshape(-1, 3)
+
+    def mean(index, count):
+        total = np.stack([np.bincount(index, weighted[:, axis], count) for axis in range(3)], -1)
+        length = np.linalg.norm(total, axis=1, keepdims=True)
+        return np.where(length > 1e-6, total / np.maximum(length, 1e-6), 0)
+
+    vertex = face.ravel()
+    normal = mean(vertex, len(position))
+    if welded:
+        _, place = np.unique(position, axis=0, return_inverse=True)
+        shared = mean(place.reshape(-1)[vertex], place.max() + 1)[place.reshape(-1)]
+        smooth = (shared * normal).sum(1, keepdims=True) > _CREASE
+        normal = np.where(smooth, shared, normal)
+    # Where face normals cancel, any of them is used, thin faces last.
+    order = np.argsort(~thin, kind="stable")
+    some = np.tile([0.0, 1.0, 0.0], (len(position), 1))
+    order = order[area[order] > 0]
+    some[face[order]] = unit[order, None]
+    return np.where((normal == 0).all(1, keepdims=True), some, normal)
 
 
 class Mesh(eqx.Module):
@@ -43,18 +228,18 @@ class Mesh(eqx.Module):
         opacity: Opacity of the vertices for rays and pictures; None if all are opaque. `jaxprt.Scene.mesh` has it.
     """
 
-    position: Float[Array, "v 3"] = eqx.field(converter=mesh_arrays.as_array)
-    face: Int[Array, "f 3"] = eqx.field(converter=mesh_arrays.as_array)
-    normal: Float[Array, "v 3"] = eqx.field(converter=mesh_arrays.as_array)
-    tangent: Float[Array, "v 3"] = eqx.field(converter=mesh_arrays.as_array)
-    region: Int[Array, " v"] = eqx.field(converter=mesh_arrays.as_array)
-    texture: Float[Array, "v 2"] | None = eqx.field(converter=mesh_arrays.as_array, default=None)
+    position: Float[Array, "v 3"] = eqx.field(converter=_as_array)
+    face: Int[Array, "f 3"] = eqx.field(converter=_as_array)
+    normal: Float[Array, "v 3"] = eqx.field(converter=_as_array)
+    tangent: Float[Array, "v 3"] = eqx.field(converter=_as_array)
+    region: Int[Array, " v"] = eqx.field(converter=_as_array)
+    texture: Float[Array, "v 2"] | None = eqx.field(converter=_as_array, default=None)
     origin: origins.Origin = eqx.field(static=True, default=origins.ZERO)
     opacity: Opacity | None = None
 
     def __check_init__(self):
         """Refuses arrays of other types and lengths. `make_mesh` and `jaxprt.Part` check values too."""
-        mesh_arrays.check_shapes(self)
+        _check_shapes(self)
 
 
 @require.arguments(path=partial(require.path, "path"))
@@ -112,7 +297,7 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     Raises:
         ValueError: There are no meshes.
     """
-    mesh_arrays.check_meshes(meshes)
+    _check_meshes(meshes)
     if not meshes:
         raise ValueError("meshes must hold at least one mesh, got none")
     meshes = aligned(meshes)
@@ -162,7 +347,7 @@ def centered(mesh: Mesh) -> Mesh:
     return mesh if mesh.origin == origins.ZERO else dataclasses.replace(mesh, origin=origins.ZERO)
 
 
-@require.arguments(mesh=mesh_arrays.check_mesh)
+@require.arguments(mesh=check_mesh)
 def split(mesh: Mesh) -> list[Mesh]:
     """Splits a mesh into one mesh per region, in ascending order. Each part becomes region 0 of its mesh.
 
@@ -191,7 +376,7 @@ def split(mesh: Mesh) -> list[Mesh]:
     return parts
 
 
-@require.arguments(mesh=mesh_arrays.check_mesh, rotation=partial(require.rotation, "rotation"))
+@require.arguments(mesh=check_mesh, rotation=partial(require.rotation, "rotation"))
 def rotate(mesh: Mesh, rotation: ArrayLike) -> Mesh:
     """Rotates a mesh about the origin: positions, normals and tangents.
 
@@ -207,7 +392,7 @@ def rotate(mesh: Mesh, rotation: ArrayLike) -> Mesh:
     return Mesh(place, mesh.face, normal, tangent, mesh.region, mesh.texture, (x, y, z), mesh.opacity)
 
 
-@require.arguments(mesh=mesh_arrays.check_mesh, direction=partial(require.real, "direction"))
+@require.arguments(mesh=check_mesh, direction=partial(require.real, "direction"))
 def brush(mesh: Mesh, direction: ArrayLike) -> Mesh:
     """Sets the tangents of a mesh to a direction of brushing, projected to the tangent plane of each vertex.
 
@@ -233,7 +418,7 @@ def brush(mesh: Mesh, direction: ArrayLike) -> Mesh:
     return eqx.tree_at(lambda each: each.tangent, mesh, directions.frame(mesh.normal, every)[:, 0])
 
 
-@require.arguments(mesh=mesh_arrays.check_mesh, vertices=partial(require.count, "vertices", least=-1, most=1 << 26))
+@require.arguments(mesh=check_mesh, vertices=partial(require.count, "vertices", least=-1, most=1 << 26))
 def ground_plane(mesh: Mesh, *, vertices: int = 22000, extent: float = 4.0) -> Mesh:
     """A square ground plane centered under a mesh.
 

@@ -7,8 +7,7 @@ import numpy as np
 import scipy
 
 from jaxprt import require
-from jaxprt.scene import mesh_arrays
-from jaxprt.scene.mesh import Mesh, bounds, centered, join, make_mesh
+from jaxprt.scene.mesh import Mesh, bounds, centered, check_mesh, join, make_mesh
 
 _UNIT = 1000.0  # meshes are scaled to this diagonal, because thresholds are absolute: the first is 1.5e-6 of it
 
@@ -38,7 +37,7 @@ def simplify(mesh: Mesh, *, faces: int) -> Mesh:
     threshold in the order of their faces instead of the best edge first; Wang, Tran, Luebke 2004, section 4.2, for the
     use.
     """
-    mesh_arrays.check_mesh(mesh)
+    check_mesh(mesh)
     require.count("faces", faces, least=4)
     if len(mesh.face) <= faces:
         return mesh

@@ -13,14 +13,13 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxprt import require
+from jaxprt.scene import material, mesh
 from jaxprt.scene import mesh as meshes
-from jaxprt.scene import mesh_arrays, part_opacity
 from jaxprt.scene import origin as origins
 from jaxprt.scene.camera import Camera, orbit
-from jaxprt.scene.environment import Environment
+from jaxprt.scene.environment import Environment, Sun
 from jaxprt.scene.material import Surface, TexturedMaterial
 from jaxprt.scene.mesh import Mesh
-from jaxprt.scene.suns import Sun
 
 _EDGE = 1e-3  # smallest difference of the cosines of a cone's angles, as in KHR_lights_punctual
 _ROUNDING = 1e-6  # by which float32 may round pi upward
@@ -63,7 +62,7 @@ class Part(eqx.Module):
         require.kind(
             f"the mesh of part {self.name!r}", self.mesh, Mesh, source="jaxprt.scene.mesh.make_mesh or jaxprt.load_mesh"
         )
-        mesh_arrays.check_values(self.mesh, f"the mesh of part {self.name!r}")
+        mesh.check_values(self.mesh, f"the mesh of part {self.name!r}")
         count = len(self.mesh.position)
         if not count or not len(self.mesh.face):
             raise ValueError(
@@ -268,7 +267,7 @@ class Scene(eqx.Module):
                 for part in self.parts
             ]
         )
-        opacity = part_opacity.of_parts(self.parts)
+        opacity = material.opacity_of_parts(self.parts)
         return whole if opacity is None else dataclasses.replace(whole, opacity=opacity)
 
 

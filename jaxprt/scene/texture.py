@@ -1,15 +1,61 @@
-"""Texture lookup, and the derivatives and handedness of texture coordinates on a mesh."""
+"""Look-ups in textures: interpolation, mip maps, derivatives by the coordinates, and normal maps.
+
+Mip maps average unit normals. The direction of a mean is the normal of its pixel. Its length says how far the normals
+are apart: for a von Mises-Fisher distribution of normals it determines the concentration k, and the variance along one
+axis is 1 / k. A microfacet distribution of width alpha has the variance alpha^2 / 2. Variances add, so that
+
+    alpha'^2 = alpha^2 + 2 / k
+
+Reference: Toksvig 2005, "Mipmapping normal maps", for the length of the mean; Han et al. 2007, "Frequency domain normal
+map filtering", for the distribution.
+"""
 
 import functools
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jax.core import Tracer
+from jaxtyping import Array, Float, Int, Num
 
 from jaxprt.compile import jit
 from jaxprt.scene.mesh import Mesh
+from jaxprt.sphere import directions
 
 WRAPS = ("repeat", "mirror", "clamp")  # beyond the edges: the image again, its mirror image, or its border texels
+_LOWEST = 0.1  # least ratio of a normal's height to its slope: lower normals are raised to it
+_FLAT = 1e-3  # Below this, slopes may be rounding errors: a normal without height is then that of the surface.
+
+
+def mipmap(image: Float[Array | np.ndarray, "h w c"]) -> list[Any]:
+    """The levels of an image's mip map, finest first; in NumPy unless JAX traces the image.
+
+    Each level averages the level before over texels of twice the edge. Odd sizes are halved and rounded up. Texels at
+    the border are then weighted by the area that they cover.
+    """
+    result: list[Any] = [image if isinstance(image, Tracer) else np.asarray(image)]
+    while max(result[-1].shape[:2]) > 1:
+        result.append(_halved(_halved(result[-1], 0), 1))
+    return result
+
+
+def _halved(image: Any, axis: int) -> Any:
+    size = image.shape[axis]
+    count = -(-size // 2)
+    if size == 2 * count:
+        pairs = image.reshape(*image.shape[:axis], count, 2, *image.shape[axis + 1 :])
+        return pairs.mean(axis + 1)
+    step = size / count
+    edge = np.arange(count + 1) * step
+    first = np.floor(edge[:-1] + 1e-9).astype(np.int64)
+    total: Any = 0.0
+    for tap in range(3):
+        texel = np.minimum(first + tap, size - 1)
+        covered = np.minimum(first + tap + 1, edge[1:]) - np.maximum(first + tap, edge[:-1])
+        weight = np.maximum(covered, 0) / step
+        wide = [-1 if each == axis else 1 for each in range(image.ndim)]
+        total = total + image.take(texel, axis) * weight.reshape(wide).astype(image.dtype)
+    return total
 
 
 @functools.partial(jit, static_argnames="wrap")
@@ -136,3 +182,77 @@ def handedness(mesh: Mesh) -> Float[np.ndarray, " v"]:
     covered = np.linalg.det(place[:, 1:] - place[:, :1])
     total = np.bincount(face.ravel(), np.repeat(covered, 3), len(mesh.position))
     return np.where(total < 0, -1.0, 1.0)
+
+
+def unit_normals(image: Any) -> Any:
+    """A normal map with all normals scaled to unit length; zero normals become that of the surface.
+
+    Args:
+        image: Texels [h w c] with (normal + 1) / 2 in their first three channels. Maps of fewer channels are returned
+            as they are. In NumPy unless JAX traces the image.
+    """
+    xp: Any = jnp if isinstance(image, Tracer) else np
+    texel = xp.asarray(image)
+    if texel.shape[2] < 3:
+        return texel
+    normal = 2 * texel[..., :3] - 1
+    square = xp.sum(normal**2, -1, keepdims=True)
+    zero = square < np.finfo(np.float32).eps
+    unit = xp.where(zero, xp.asarray([0.0, 0.0, 1.0], texel.dtype), normal / xp.sqrt(xp.where(zero, 1, square)))
+    return (unit + 1) / 2
+
+
+def tilt_normals(
+    frame: Float[Array | np.ndarray, "p 3 3"],
+    handedness: Num[Array | np.ndarray, " p"],
+    mean: Float[Array | np.ndarray, "p 3"],
+    scale: Float[Array | np.ndarray, " p"],
+) -> Float[Array, "p 3"]:
+    """Unit normals in world space.
+
+    Normals that point along the surface or below it are raised to about six degrees above it, so that they are lit.
+
+    Args:
+        frame: Shading frames of the smooth surface; rows are tangent, bitangent, normal.
+        handedness: -1 where the bitangent of the texture coordinates is opposite to that of the frame, 1 elsewhere.
+        mean: Mean normals of the map in the frame of the texture coordinates, of any length.
+        scale: Factor of the first two components.
+    """
+    x, y = mean[:, 0] * scale, mean[:, 1] * scale * handedness
+    square = x**2 + y**2
+    flat = square < _FLAT**2
+    slope = jnp.where(flat, 0, jnp.sqrt(jnp.where(flat, 1, square)))
+    height = jnp.maximum(mean[:, 2], _LOWEST * slope)
+    height = jnp.where(flat & (height < _FLAT), 1, height)
+    local = jnp.stack([x, y, height], -1)
+    return directions.normalize(sum(local[:, i, None] * frame[:, i] for i in range(3)))
+
+
+def normal_variance(
+    mean: Float[Array | np.ndarray, "p 3"],
+    scale: Float[Array | np.ndarray, " p"],
+    footprint: Float[Array | np.ndarray, " p"],
+) -> Float[Array, " p"]:
+    """Variance along one axis, in squared radians, of the normals that a pixel averages.
+
+    Between texels of a map that is seen magnified, the mean of their normals is shorter too, although the pixel sees
+    one normal. The variance is therefore reduced where a pixel covers less than a texel.
+
+    Args:
+        mean: Mean of the unit normals of the map.
+        scale: Factor of the slopes of the map.
+        footprint: Longest edge of the footprint with which the map is read, in texels.
+    """
+    square = jnp.clip(jnp.sum(mean**2, -1), 1e-4, 1)
+    length = jnp.sqrt(square)
+    inverse = (1 - square) / (length * (3 - square))  # 1 / k, as of Banerjee et al. 2005
+    return inverse * scale**2 * jnp.minimum(footprint, 1) ** 2
+
+
+def widen_roughness(
+    roughness: Float[Array | np.ndarray, " p"], variance: Float[Array | np.ndarray, " p"]
+) -> Float[Array, " p"]:
+    """Roughness, the square root of alpha, of a surface whose normals have a variance along one axis; at most 1."""
+    spread = variance > 0
+    wide = jnp.where(spread, roughness, 1) ** 4 + 2 * variance
+    return jnp.where(spread, jnp.minimum(jnp.sqrt(jnp.sqrt(wide)), jnp.maximum(roughness, 1)), roughness)

@@ -18,7 +18,7 @@ from jaxprt.scene.mesh import Mesh, relative
 from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.systems import adaptive, protocol
-from jaxprt.visibility.arguments import PRECOMPUTE
+from jaxprt.visibility.rays import PRECOMPUTE
 
 _BLOCK = 64
 _MIRROR = np.array([-1, -1, 1], np.float32)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxprt import require
-from jaxprt.image.tone_curves import toned
+from jaxprt.image.tonemap import toned
 
 MOST_BYTES = 1 << 29  # largest message, such as one with an environment map
 _MOST_JSON = 1 << 24  # bytes of the JSON of a message; it takes many times its size in memory

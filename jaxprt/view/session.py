@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float
 
 from jaxprt import require
 from jaxprt.image import display, render, sky
-from jaxprt.image.layers import seen_from_front
-from jaxprt.image.tone_curves import TONES
+from jaxprt.image.pixels import seen_from_front
+from jaxprt.image.tonemap import TONES
 from jaxprt.relit import exact
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.measuring import lights_of

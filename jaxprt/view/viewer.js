@@ -22,7 +22,7 @@ vec3 agx(vec3 x){
   x = (((((15.5 * x - 40.14) * x + 31.96) * x - 6.868) * x + .4298) * x + .1191) * x - .00232;
   x = x * inverse(mat3(.899796956, .0871996192, .0130034249, .111420989, .875575586, .0130034249, .111420989, .0871996192, .801379392));
   return pow(max(x, 1e-6), vec3(2.2)) * back; }
-// The curves of jaxprt/image/tone_curves.py. Matrices stand in rows, to the right of vectors.
+// The curves of jaxprt/image/tonemap.py. Matrices stand in rows, to the right of vectors.
 vec3 display(vec3 x){ if (encoded) return x; x = clamp(x * gain, 0., 1e6);
   x = clamp(tone == 1 ? hable(2. * x) / hable(vec3(11.2)) : tone == 2 ? agx(x) : tone == 3 ? aces(x) : x, 0., 1.);
   return mix(12.92 * x, 1.055 * pow(max(x, vec3(1e-6)), vec3(1. / 2.4)) - .055, step(.0031308, x)); }`;

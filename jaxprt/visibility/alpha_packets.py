@@ -14,7 +14,7 @@ from numba.core import types
 from numba.extending import intrinsic
 
 from jaxprt.scene import texture
-from jaxprt.scene.opacity import BLEND, CLEAR, Opacity
+from jaxprt.scene.mesh import BLEND, CLEAR, Opacity
 from jaxprt.scene.subdivision import places
 from jaxprt.visibility import packets
 
@@ -344,7 +344,7 @@ def _passed(address, scene, origin, direction, point, way, share):
     context, arguments = np.empty(16, np.int64), np.empty(4, np.int64)
     _empty_context(context, arguments, _PASSED)
     context[_FIELD] = share.ctypes.data
-    ray, valid = packets.room(12)
+    ray, valid = packets.ray_buffers(12)
     for packet in range(0, len(point), 16):
         count = min(16, len(point) - packet)
         for lane in range(16):
@@ -382,7 +382,7 @@ def _stopped(origin, direction, point, way, share):
 def _first(address, scene, origin, direction, face, part, distance, weight):
     context, arguments = np.empty(16, np.int64), np.empty(4, np.int64)
     _empty_context(context, arguments, _FIRST)
-    ray, valid = packets.room(24)
+    ray, valid = packets.ray_buffers(24)
     number = ray.view(np.uint32)
     for packet in range(0, len(origin), 16):
         count = min(16, len(origin) - packet)
@@ -412,7 +412,7 @@ def _collected(address, scene, origin, direction, far, hidden, count, place, fac
     context[_FIELD], context[_FIELD + 1] = count.ctypes.data, place.ctypes.data
     context[_FIELD + 2], context[_FIELD + 3] = face.ctypes.data, alpha.ctypes.data
     context[_FIELD + 4] = hidden.ctypes.data
-    ray, valid = packets.room(24)
+    ray, valid = packets.ray_buffers(24)
     number = ray.view(np.uint32)
     for packet in range(0, len(direction), 16):
         rays = min(16, len(direction) - packet)

@@ -17,7 +17,7 @@ import numpy as np
 import tqdm
 from threadpoolctl import threadpool_limits
 
-from jaxprt.files import mapped
+from jaxprt.files import arrays
 from jaxprt.files.arrays import BlockStore, Layout
 from jaxprt.scene.mesh import Mesh
 
@@ -188,7 +188,7 @@ class _Kept:
     def __init__(self, job: Job, counts: Mapping[str, int]):
         self._job = job
         self.array = {
-            name: mapped.empty((*at.shape[: at.axis], counts[name], *at.shape[at.axis + 1 :]), at.dtype)
+            name: arrays.empty((*at.shape[: at.axis], counts[name], *at.shape[at.axis + 1 :]), at.dtype)
             for name, at in job.layout.items()
         }
 

@@ -9,9 +9,8 @@ from jaxtyping import Bool, Float, Float32, Int
 from jaxprt.scene import subdivision
 from jaxprt.scene.light_samples import LightSamples
 from jaxprt.scene.mesh import Mesh
-from jaxprt.visibility.buried import inside
 from jaxprt.visibility.occluder import Occluder, offsets
-from jaxprt.visibility.starts import start_points, starts_and_buried
+from jaxprt.visibility.starts import inside, start_points, starts_and_buried
 
 _RAYS = 1 << 17  # rays per call, so that they fit in a core's cache
 

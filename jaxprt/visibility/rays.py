@@ -13,16 +13,19 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Float32, UInt8
+from jaxtyping import Array, Bool, Float, Float32, Int, UInt8
 
+from jaxprt import require
 from jaxprt.files.arrays import sketch
 from jaxprt.scene import origin as origins
-from jaxprt.scene.mesh import Mesh, frames, relative
+from jaxprt.scene.mesh import Mesh, check_kinds, frames, relative
 from jaxprt.sphere import cubemap
 from jaxprt.visibility import blocks
 from jaxprt.visibility.occluder import Occluder
 from jaxprt.visibility.starts import start_points
 
+_MOST = 1 << 15  # texels along the edge of a face: 80 GB for one vertex
+_SOURCE = "jaxprt.scene.mesh.make_mesh or jaxprt.load_mesh"
 ALGORITHM = 4  # version of the ray casting; raised by a release whose rays give other results
 ROUNDING = 3e-6  # relative to the norm: larger than the rounding error of single precision
 BLOCK = 64  # vertices in a block: a fraction of a second of work
@@ -30,6 +33,45 @@ LEVELS = 16  # visibility is stored in sixteenths: 4 x 4 rays per texel
 _SIDE = 4
 _KRONECKER = 0.6180339887498949, 0.7548776662466927  # of texels and vertices
 _RAYS = 1 << 17  # rays per call, so that they fit in a core's cache
+
+
+def _mesh(value: Any) -> None:
+    require.kind("the mesh", value, Mesh, source=_SOURCE)
+    check_kinds(value, "the mesh")
+
+
+def _occluder(value: Any) -> None:
+    if value is not None:
+        require.kind("the occluder", value, Mesh, source=_SOURCE)
+        check_kinds(value, "the occluder")
+
+
+def _vertex(value: Any) -> None:
+    if value is not None:
+        wrong = require.unreal(value)
+        if wrong and wrong != "booleans":
+            raise TypeError(f"vertex must be a mask or indices, got {wrong}")
+
+
+def _path(value: Any) -> None:
+    if value is not None:
+        require.path("path", value)
+
+
+def _size(value: Any) -> None:
+    require.whole("size", value)  # Systems say which smaller sizes they take.
+    if value > _MOST:
+        raise ValueError(f"size must be at most {_MOST}, got {value}")
+
+
+PRECOMPUTE = {
+    "mesh": _mesh,
+    "occluder": _occluder,
+    "vertex": _vertex,
+    "path": _path,
+    "executor": require.executor,
+    "size": _size,
+}
 
 
 @dataclass(frozen=True)
@@ -300,3 +342,67 @@ def _supersample(occluder, start, vertex, texel, table) -> np.ndarray:
         shadow = occluder.blocked(start, table.fine, np.repeat(vertex[part], LEVELS), way)
         out[part] = LEVELS - shadow.reshape(-1, LEVELS).sum(1, dtype=np.uint8)
     return out
+
+
+def hemisphere_hits(
+    occluder: Occluder, start: Float[np.ndarray, "b 3"], normal: Float[np.ndarray, "b 3"], *, size: int
+) -> tuple[Int[np.ndarray, " h"], Int[np.ndarray, " h"], Int[np.ndarray, "h 3"], Float[np.ndarray, "h 3"], int]:
+    """Intersections of a scene with rays from some points through all cubemap texels above their horizons.
+
+    Args:
+        occluder: The scene.
+        start: Origins of the rays.
+        normal: Unit normals at these points.
+        size: Edge of the cubemap's faces in texels.
+
+    Returns:
+        For each hit the index of the point, the index of the texel, the vertices of the triangle and its barycentric
+        coordinates; and the total number of rays.
+    """
+    area = np.asarray(cubemap.vector_area(size=size), np.float32).reshape(-1, 3)
+    direction = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)
+    point, texel = np.nonzero(normal @ area.T > 0)
+    triangle, _, barycentric = occluder.hit(start[point], direction[texel])
+    met = np.flatnonzero(triangle >= 0)
+    corner = occluder.facing(triangle[met], direction[texel[met]])
+    return point[met], texel[met], corner, barycentric[met], len(point)
+
+
+def hits_front(
+    occluder: Occluder,
+    normal: Float[np.ndarray, "v 3"],
+    corner: Int[np.ndarray, "h 3"],
+    direction: Float[np.ndarray, "h 3"],
+) -> Bool[np.ndarray, " h"]:
+    """Whether each ray hits the front of a triangle. Only fronts reflect light.
+
+    The front is the side to which the sum of the corners' normals points, because a single normal may face away from a
+    ray that hits the front.
+    """
+    at = occluder.position[corner]
+    across = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
+    across = across / np.maximum(np.abs(across).max(-1, keepdims=True), np.finfo(np.float32).tiny)
+    side = np.sum(across * np.sum(normal[corner], 1), -1)
+    return side * np.sum(across * direction, -1) < 0
+
+
+def first_fronts(
+    occluder: Occluder,
+    normal: Float[np.ndarray, "v 3"],
+    start: Float32[np.ndarray, "b 3"],
+    direction: Float32[np.ndarray, "b 3"],
+) -> tuple[Int[np.ndarray, " b"], Float[np.ndarray, "b 3"]]:
+    """The first triangle on each ray and its barycentric coordinates; -1 if the ray hits nothing or a back.
+
+    Args:
+        occluder: The scene.
+        normal: Normals of the scene's vertices.
+        start: Origins of the rays.
+        direction: Unit directions.
+    """
+    triangle, _, barycentric = occluder.hit(start, direction)
+    met = np.flatnonzero(triangle >= 0)
+    triangle[met], barycentric[met] = occluder.toward(triangle[met], direction[met], barycentric[met])
+    triangle[met[~hits_front(occluder, normal, occluder.face[triangle[met]], direction[met])]] = -1
+    weight = np.clip(barycentric, 0, 1)
+    return triangle, weight / np.maximum(weight.sum(1, keepdims=True), 1e-6)

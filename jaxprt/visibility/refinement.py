@@ -19,14 +19,14 @@ from threadpoolctl import threadpool_limits
 
 from jaxprt import require
 from jaxprt.scene import light_samples, subdivision
-from jaxprt.scene.camera import Camera
+from jaxprt.scene.camera import Camera, orbit
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh, relative
-from jaxprt.scene.subdivision import Division, Edges
-from jaxprt.visibility import blocks, shown
-from jaxprt.visibility.arguments import PRECOMPUTE
+from jaxprt.scene.subdivision import Division, Edges, Points
+from jaxprt.visibility import blocks
 from jaxprt.visibility.diffuse import DiffuseTracer
 from jaxprt.visibility.occluder import Occluder, check
+from jaxprt.visibility.rays import PRECOMPUTE, first_fronts
 
 ALGORITHM = 1  # version of the division; raised by a release that divides otherwise
 
@@ -42,6 +42,70 @@ _SHARE = 0.7  # share of the squared error whose triangles are divided before ra
 _TOGETHER = 0.5  # A triangle's edge is cut if its squared difference is at least this share of the triangle's largest.
 _SHORTEST = 256  # length of the shortest edge that is cut, relative to the offset of ray origins from the surface
 _ROUNDING = 1e-5  # relative difference that rounding may cause
+EDGE = 64  # rays along an edge of a picture
+_MOST = 16  # largest number of cameras
+_TURNS = ((0.5, 0.3), (2.6, 0.6), (4.7, 0.15))  # azimuth and elevation of the cameras around the scene
+_CLOSER = ((0.9, 0.4), (3.6, 0.25))  # and around parts
+
+
+def cameras(mesh: Mesh, given: Sequence[Camera], parts: Sequence[Mesh]) -> list[Camera]:
+    """Cameras from which a scene is likely to be seen: its own, some around it, and some around its parts.
+
+    Args:
+        mesh: The mesh of all parts.
+        given: The cameras of the scene.
+        parts: The meshes of the parts.
+    """
+    size = {"width": EDGE, "height": EDGE}
+    around = [orbit(mesh, azimuth=azimuth, elevation=elevation, **size) for azimuth, elevation in _TURNS]
+    chosen = [*given[: _MOST // 2], *around]
+    # Parts with many triangles are what scenes are about.
+    solid = [part for part in parts if len(part.face)] if len(parts) > 1 else []
+    order = sorted(solid, key=lambda part: -len(part.face))
+    for part in order[: (_MOST - len(chosen)) // len(_CLOSER)]:
+        chosen += [orbit(part, azimuth=azimuth, elevation=elevation, **size) for azimuth, elevation in _CLOSER]
+    return chosen
+
+
+def places(mesh: Mesh, occluder: Occluder, views: Sequence[Camera]) -> tuple[Points, Float[np.ndarray, " p"]]:
+    """Points of a mesh that cameras see from the front, and the share of all pictures that each stands for.
+
+    Args:
+        mesh: The mesh, whose triangles are those of the occluder.
+        occluder: The triangles.
+        views: The cameras, in the coordinates of the mesh's file.
+    """
+    normal = np.asarray(mesh.normal)
+    triangles: list[Int[np.ndarray, " _"]] = []
+    weights, shares = [], []
+    for camera in views:
+        eye, direction = _rays(camera.local(mesh.origin))
+        triangle, weight = first_fronts(occluder, normal, np.repeat(eye[None], len(direction), 0), direction)
+        seen = triangle >= 0
+        if seen.any():
+            triangles.append(triangle[seen])
+            weights.append(weight[seen])
+            shares.append(np.full(np.count_nonzero(seen), 1 / np.count_nonzero(seen)))
+    if not triangles:
+        return Points(np.zeros(0, np.int64), np.zeros((0, 3))), np.zeros(0)
+    share = np.concatenate(shares) / len(shares)
+    return Points(np.concatenate(triangles), np.concatenate(weights).astype(np.float64)), share
+
+
+def _rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """The eye, and unit directions through the pixels of a small picture of the camera's shape."""
+    eye, target, up = (np.asarray(each, np.float64) for each in (camera.eye, camera.target, camera.up))
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6 * max(np.linalg.norm(up), 1e-30):
+        right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
+    right /= np.linalg.norm(right)
+    height = np.tan(float(camera.field_of_view) / 2)
+    across = height * camera.width / camera.height
+    x, y = np.meshgrid(*[(np.arange(EDGE) + 0.5) / EDGE * 2 - 1] * 2)
+    way = forward + across * x[..., None] * right - height * y[..., None] * np.cross(right, forward)
+    way = (way / np.linalg.norm(way, axis=-1, keepdims=True)).reshape(-1, 3)
+    return eye.astype(np.float32), way.astype(np.float32)
 
 
 @require.arguments(**PRECOMPUTE)
@@ -88,7 +152,7 @@ def refine(
     options = {"error": error, "vertices": vertices, "environments": environments, "progress": progress}
     check(mesh, "mesh")
     shadowing = mesh if occluder is None else relative(occluder, mesh.origin)
-    return subdivision.subdivide(mesh, divisions(mesh, shadowing, views=shown.cameras(mesh, (), ()), **options)[0])
+    return subdivision.subdivide(mesh, divisions(mesh, shadowing, views=cameras(mesh, (), ()), **options)[0])
 
 
 def divisions(
@@ -165,7 +229,7 @@ def interpolation_error(mesh: Mesh, *, views: Sequence[Camera]) -> float:
 
 
 def _seen(mesh: Mesh, views: Sequence[Camera]) -> tuple[subdivision.Points, Float[np.ndarray, " p"]]:
-    return shown.places(mesh, Occluder(mesh), views)
+    return places(mesh, Occluder(mesh), views)
 
 
 class _Surface:

@@ -22,7 +22,7 @@ from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import haar
 from jaxprt.visibility import blocks, rays
-from jaxprt.visibility.arguments import PRECOMPUTE
+from jaxprt.visibility.rays import PRECOMPUTE
 
 # Versions of the algorithms; a release that changes results raises one of them.
 ALGORITHM = {"visibility": rays.ALGORITHM, "direct": 1}

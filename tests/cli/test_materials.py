@@ -6,7 +6,7 @@ import pytest
 
 import jaxprt as prt
 from jaxprt.brdf import measured
-from jaxprt.cli import materials
+from jaxprt.cli import inputs
 
 WI, WO = np.array([[0.6, 0.0, 0.8], [0.0, 0.28, 0.96]]), np.array([[-0.36, 0.48, 0.8], [0.0, -0.28, 0.96]])
 PAIR = jnp.asarray(WI, jnp.float32), jnp.asarray(WO, jnp.float32)
@@ -41,7 +41,7 @@ SCALE = np.array([1, 1.15, 1.66])
     ],
 )
 def test_a_model_by_its_name_and_numbers_is_that_model(text, expected):
-    made = materials.parse(text)
+    made = inputs.parse(text)
     assert type(made) is type(expected)
     np.testing.assert_array_equal(made(*PAIR), expected(*PAIR))
 
@@ -50,11 +50,11 @@ def test_every_model_of_the_package_has_a_name_and_the_material_of_gltf_can_chan
     models = {
         each for each in vars(prt.brdf).values() if isinstance(each, type) and issubclass(each, prt.brdf.models.Model)
     }
-    named = {*materials.MODELS.values(), prt.brdf.MetallicRoughness, prt.brdf.SchlickDiffuse}
+    named = {*inputs.MODELS.values(), prt.brdf.MetallicRoughness, prt.brdf.SchlickDiffuse}
     assert models <= named
-    made = materials.parse("metallic-roughness:base_color=.9/.6/.2,metallic=0,roughness=.3")
+    made = inputs.parse("metallic-roughness:base_color=.9/.6/.2,metallic=0,roughness=.3")
     assert isinstance(made, prt.scene.TexturedMaterial)
-    assert materials.describe(made)["base_color"] == pytest.approx([0.9, 0.6, 0.2])
+    assert inputs.describe(made)["base_color"] == pytest.approx([0.9, 0.6, 0.2])
 
 
 @pytest.mark.parametrize(
@@ -75,7 +75,7 @@ def test_every_model_of_the_package_has_a_name_and_the_material_of_gltf_can_chan
 )
 def test_what_is_no_material_is_refused_by_what_was_required_and_what_came(text, words):
     with pytest.raises(ValueError, match=words):
-        materials.parse(text)
+        inputs.parse(text)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_what_is_no_material_is_refused_by_what_was_required_and_what_came(text,
 def test_fits_of_ngan_are_the_published_lobes_in_the_colors_of_merl(tmp_path, model, more, lobe):
     path = tmp_path / "ngan.fit"
     path.write_text(NGAN.format(model=model, more=more))
-    made = materials.parse(f"ngan:{path},material=a-metal")
+    made = inputs.parse(f"ngan:{path},material=a-metal")
     expected = np.array([0.1, 0.2, 0.3]) * SCALE / np.pi + lobe(np.array([0.3, 0.2, 0.1]) * SCALE)
     np.testing.assert_allclose(made(*PAIR), expected, rtol=1e-4)
 
@@ -137,9 +137,9 @@ def test_files_of_measurements_are_read_by_their_loaders(data):
             prt.brdf.load_ngan(folder / "ngan2005_wardduer.fit", "nickel"),
         ),
     ):
-        np.testing.assert_array_equal(materials.parse(text)(*PAIR), expected(*PAIR))
+        np.testing.assert_array_equal(inputs.parse(text)(*PAIR), expected(*PAIR))
     with pytest.raises(ValueError, match="one of 100 names such as nickel"):
-        materials.parse(f"npf:{npf},material=nickle")
+        inputs.parse(f"npf:{npf},material=nickle")
     # The file and the table of the 86 fits of Cook-Torrance's model say the same.
     family = prt.brdf.navigation.cook_torrance(path=folder / "ngan2005_cooktorrance.csv")
     number = family.name.index("nickel")
@@ -155,4 +155,4 @@ def test_the_merl_form_is_read(tmp_path, monkeypatch):
     path = tmp_path / "gray.binary"
     path.write_bytes(np.array([2, 2, 4], "<i4").tobytes() + np.full(48, 30.0).astype("<f8").tobytes())
     expected = 30 * SCALE / 1500
-    np.testing.assert_allclose(materials.parse(f"merl:{path}")(*PAIR), np.broadcast_to(expected, (2, 3)), rtol=1e-5)
+    np.testing.assert_allclose(inputs.parse(f"merl:{path}")(*PAIR), np.broadcast_to(expected, (2, 3)), rtol=1e-5)

@@ -12,7 +12,7 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from jaxprt.files import arrays, mapped
+from jaxprt.files import arrays
 from jaxprt.files.arrays import BlockStore, Layout
 
 LAYOUT = {"index": Layout((3, 4), 1, "uint16"), "value": Layout((3, 4, 2), 1, "float32")}
@@ -105,14 +105,14 @@ def test_whole_arrays_are_cut_to_their_entries_and_mapped_where_blocks_follow_ea
         expected = np.concatenate([block(number)[name] for number in range(BLOCKS)], axis)
         found = store.whole(name, count)
         np.testing.assert_array_equal(found, np.take(expected, np.arange(count), axis))
-        assert found.ctypes.data % mapped.ALIGN == 0
-        assert mapped.reference(found) is found
+        assert found.ctypes.data % arrays.ALIGN == 0
+        assert arrays.reference(found) is found
     first = store.whole("first", count)
     np.testing.assert_array_equal(first[:, 1], np.arange(count) // 4)
-    there = mapped.reference(first)
-    assert isinstance(there, mapped.Reference)
+    there = arrays.reference(first)
+    assert isinstance(there, arrays.Reference)
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(there)).open(), first)
-    assert mapped.reference(first[1:]) is not None
+    assert arrays.reference(first[1:]) is not None
     (store.path / "first.npy").rename(tmp_path / "gone")
     with pytest.raises(FileNotFoundError, match=r"first\.npy must be seen by all workers"):
         there.open()

@@ -7,7 +7,7 @@ import PIL.Image
 import PIL.ImageCms
 import pytest
 
-from jaxprt.files import color_spaces, decode_image, read_image, write_png
+from jaxprt.files import decode_image, pixels, read_image, write_png
 
 D65, ACES_WHITE = (0.3127, 0.3290), (0.32168, 0.33767)
 # Published to four or more digits: the OpenColorIO configuration of ACES (AP0, AP1, with Bradford's adaptation),
@@ -40,7 +40,7 @@ DIGITS = 1e-4
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_matrices_to_rec709_are_the_published_ones(name):
     chromaticities, published = PUBLISHED[name]
-    matrix = color_spaces.to_rec709(chromaticities, name)
+    matrix = pixels.to_rec709(chromaticities, name)
     np.testing.assert_allclose(matrix, published, atol=DIGITS)
     np.testing.assert_allclose(matrix @ np.ones(3), 1, rtol=1e-12)
 
@@ -49,9 +49,9 @@ def test_xyz_is_a_color_space_too():
     """Linear sRGB of XYZ (IEC 61966-2-1), where white is adapted from equal energy to D65."""
     xyz = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0)
     published = [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
-    matrix = color_spaces.to_rec709((*xyz, 0.3127, 0.3290), "XYZ")
+    matrix = pixels.to_rec709((*xyz, 0.3127, 0.3290), "XYZ")
     np.testing.assert_allclose(matrix @ np.diag(1 / np.array([0.9505, 1, 1.0891])), published, atol=1e-3)
-    np.testing.assert_allclose(color_spaces.to_rec709((*xyz, 1 / 3, 1 / 3), "XYZ") @ np.ones(3), 1, rtol=1e-12)
+    np.testing.assert_allclose(pixels.to_rec709((*xyz, 1 / 3, 1 / 3), "XYZ") @ np.ones(3), 1, rtol=1e-12)
 
 
 def chunk(name, data):
@@ -169,7 +169,7 @@ LINEAR = b"curv\0\0\0\0\0\0\0\0"
 
 def test_the_profile_that_others_make_for_srgb_is_srgb():
     made = PIL.ImageCms.ImageCmsProfile(PIL.ImageCms.createProfile("sRGB")).tobytes()
-    assert not color_spaces.icc_difference(made, curves=True)
+    assert not pixels.icc_difference(made, curves=True)
 
 
 @pytest.mark.parametrize(
@@ -190,9 +190,9 @@ def test_the_profile_that_others_make_for_srgb_is_srgb():
     ],
 )
 def test_profiles_are_compared_with_srgb(profile, words):
-    difference = color_spaces.icc_difference(profile, curves=True)
+    difference = pixels.icc_difference(profile, curves=True)
     assert words in difference if words else not difference
-    assert "curve" not in color_spaces.icc_difference(profile, curves=False)
+    assert "curve" not in pixels.icc_difference(profile, curves=False)
 
 
 @pytest.mark.parametrize("name", ["image.png", "image.jpg", "image.tif"])

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.files import image_writing, read_image, write_exr, write_png
+from jaxprt.files import outputs, read_image, write_exr, write_png
 
 
 def random_image(*shape, seed=0):
@@ -103,7 +103,7 @@ def test_a_full_disk_raises_an_os_error_and_leaves_the_old_file(tmp_path, write,
 def test_a_file_that_does_not_hold_what_was_written_is_not_accepted(tmp_path, monkeypatch, write, suffix):
     path = tmp_path / f"image{suffix}"
     write(path, random_image(4, 5, 3))
-    old, compare = path.read_bytes(), image_writing._compare
+    old, compare = path.read_bytes(), outputs._compare
 
     def damaged(change):
         def check(new, *values):
@@ -117,7 +117,7 @@ def test_a_file_that_does_not_hold_what_was_written_is_not_accepted(tmp_path, mo
     changes = [lambda data: b"", lambda data: data[:-1], lambda data: data[: len(data) // 2]]
     changes += [lambda data: data[:3000] + bytes(500) + data[3500:], lambda data: other.read_bytes()]
     for change in changes:
-        monkeypatch.setattr(image_writing, "_compare", damaged(change))
+        monkeypatch.setattr(outputs, "_compare", damaged(change))
         with pytest.raises(OSError, match=rf"image{suffix} cannot be written: the file is incomplete"):
             write(path, random_image(90, 80, 3))
         assert path.read_bytes() == old
@@ -144,7 +144,7 @@ def test_directories_pipes_and_devices_are_not_replaced(tmp_path, write, suffix)
 
 
 def test_what_is_not_finite_and_large_images_are_written_in_blocks(tmp_path, monkeypatch):
-    monkeypatch.setattr(image_writing, "_BLOCK", 1)
+    monkeypatch.setattr(outputs, "_BLOCK", 1)
     image = random_image(50, 20, 3)
     image[3, 4], image[40, 2] = [np.nan, np.inf, -np.inf], [-1.0, 1e38, 1e-40]
     write_exr(tmp_path / "image.exr", image)

@@ -9,7 +9,7 @@ import OpenImageIO
 import pytest
 
 from jaxprt import require
-from jaxprt.files import decode_image, exr, pixels, read_image, write_exr, write_png
+from jaxprt.files import decode_image, images, pixels, read_image, write_exr, write_png
 
 
 def random_image(*shape, seed=0):
@@ -227,7 +227,7 @@ def test_reading_in_blocks_of_rows_gives_what_reading_at_once_gives(tmp_path, mo
     whole = read_image(path)[0]
     for values in (1, 31 * 3 * 7):
         monkeypatch.setattr(pixels, "_VALUES", values)
-        monkeypatch.setattr(exr, "_LINES", 16)
+        monkeypatch.setattr(images, "_LINES", 16)
         np.testing.assert_array_equal(read_image(path)[0], whole)
 
 

@@ -20,7 +20,7 @@ import pytest
 import jaxprt as prt
 from jaxprt import separable
 from jaxprt.brdf import navigation
-from jaxprt.files import fields, mapped
+from jaxprt.files import arrays, objects
 from jaxprt.sphere import hemisphere
 
 # Host records of the command line, of reports, of files that are read, and libraries; no user saves them.
@@ -110,7 +110,7 @@ def same(one, other):
 
 
 def test_every_class_of_the_package_is_the_same_after_saving_and_after_pickling(tmp_path, monkeypatch):
-    monkeypatch.setattr(fields, "_run_checks", lambda value: None)  # which relate the values of fields
+    monkeypatch.setattr(objects, "_run_checks", lambda value: None)  # which relate the values of fields
     random = np.random.default_rng(0)
     every = {f"{kind.__module__}.{kind.__name__}": filled(kind, random) for kind in classes()}
     for name in ("SeparableBrdf", "DynamicBrdf", "TransferTensor", "RegionTransport", "Plan", "Environment", "Camera"):
@@ -224,7 +224,7 @@ def test_nothing_is_replaced_and_a_save_that_fails_leaves_nothing(tmp_path, monk
         assert not other.exists()
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(mapped, "write_header", full)
+    monkeypatch.setattr(arrays, "write_header", full)
     with pytest.raises(OSError, match="no space"):
         prt.files.save(other, jnp.zeros(3))
     assert [file.name for file in tmp_path.iterdir()] == ["a.prt"]
@@ -331,8 +331,8 @@ def test_arrays_of_devices_are_maps_of_their_files_on_cpus_and_those_of_the_host
     both = jnp.arange(4096.0), np.arange(4096.0)
     prt.files.save(tmp_path / "a.prt", both)
     device, host = prt.files.load(tmp_path / "a.prt")
-    there = mapped.reference(np.asarray(device))
-    assert isinstance(there, mapped.Reference)
+    there = arrays.reference(np.asarray(device))
+    assert isinstance(there, arrays.Reference)
     assert there.path == str(tmp_path / "a.prt" / "0.npy")
     host[0] = 7
     same(prt.files.load(tmp_path / "a.prt"), both)

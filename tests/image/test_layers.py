@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from jaxprt.image import interpolate, layers, resolve
-from jaxprt.image.layers import visible_points
+from jaxprt.image import interpolate, pixels, resolve
+from jaxprt.image.pixels import visible_points
 from jaxprt.scene import Camera, Part, Scene, Texture, TexturedMaterial
 from jaxprt.scene.mesh import grid_face, make_mesh
 from jaxprt.visibility import Occluder
@@ -79,7 +79,7 @@ def test_a_part_that_is_not_there_is_not_drawn():
 def test_single_samples_choose_translucent_surfaces_by_their_opacity():
     glass = TexturedMaterial(alpha=0.3, alpha_mode="blend")
     mesh = Scene([Part("glass", sheet(0.5), glass), Part("wall", sheet(0.0), PLAIN)]).mesh
-    seen = layers.nearest_fragments(mesh, CAMERA, occluder=Occluder(mesh))
+    seen = pixels.nearest_fragments(mesh, CAMERA, occluder=Occluder(mesh))
     triangle = np.asarray(seen.triangle)[10:22, 10:22]
     assert np.mean(triangle < 2) == pytest.approx(0.3, abs=0.1)
     np.testing.assert_allclose(np.asarray(seen.barycentric)[10:22, 10:22].sum(-1), 1, rtol=1e-5)

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from jaxprt.cli import play
 from jaxprt.view import Server, messages
-from jaxprt.view.address import parse
+from jaxprt.view.server import parse
 from tests.view.peers import Echo, Proxy, exchange
 
 GOOD = messages.pack({"kind": "look"}, [])

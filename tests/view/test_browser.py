@@ -13,7 +13,7 @@ from PIL import Image
 
 import jaxprt as prt
 from jaxprt import files, image
-from jaxprt.image import tone_curves
+from jaxprt.image import tonemap
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.environment import rotate
 from jaxprt.systems import standard
@@ -476,7 +476,7 @@ def test_the_page_displays_colors_by_the_tone_curves_of_python(hand):
     hand.page.evaluate(f"() => Object.assign(({CANVAS}).state, {{ still: false, background: false }})")
     place = "document.querySelector('#viewer').shadowRoot.querySelectorAll('select')"
     shown = {}
-    for number, tone in enumerate(tone_curves.TONES):
+    for number, tone in enumerate(tonemap.TONES):
         hand.page.evaluate(
             f"() => {{ const select = [...{place}].find((each) => each.options[1]?.text === 'filmic');"
             f" select.value = {number}; select.onchange(); }}"
@@ -487,8 +487,8 @@ def test_the_page_displays_colors_by_the_tone_curves_of_python(hand):
     linear = np.asarray(image.decode_srgb(shown["srgb"].reshape(-1, 3)))
     inside = (linear.max(-1) < 0.97) & (linear.min(-1) > 0.03)  # neither clamped nor coarse in bytes
     assert inside.mean() > 0.05
-    for tone in tone_curves.TONES[1:]:
-        expected = np.asarray(image.encode_srgb(tone_curves.toned(linear[inside], tone, np)))
+    for tone in tonemap.TONES[1:]:
+        expected = np.asarray(image.encode_srgb(tonemap.toned(linear[inside], tone, np)))
         found = shown[tone].reshape(-1, 3)[inside]
         # Bytes of the first picture, and their slope.
         assert np.median(np.abs(found - expected)) < 0.006

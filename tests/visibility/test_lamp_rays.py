@@ -7,7 +7,7 @@ from jaxprt.scene import Mesh, PointLight
 from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.sphere import directions
 from jaxprt.systems.lamps.places import at_points, places
-from jaxprt.visibility import Occluder, lamp_rays, texel_rays
+from jaxprt.visibility import Occluder, picture_rays
 
 EDGE = 32  # points along the edge of the ground, which is one square from -1 to 1
 HEIGHT, RADIUS = 0.6, 0.3
@@ -49,13 +49,13 @@ def seen(lamps, *others: Mesh) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
     triangle = np.where(weight[0].min(1) >= 0, 0, 1)
     slope = np.linalg.solve(planes, np.array([[2 / EDGE, 0], [0, 2 / EDGE], [0, 0]])[None]).transpose(0, 2, 1)
     number = np.arange(EDGE**2)
-    points = texel_rays.PicturePoints(
+    points = picture_rays.PicturePoints(
         triangle, weight[triangle, number], slope[triangle], number // EDGE, number % EDGE
     )
     position, normal = np.stack([x, 0 * x, z], 1), np.tile([0.0, 1, 0], (EDGE**2, 1))
     mesh = join([GROUND, *(lamp for lamp in lamps if isinstance(lamp, Mesh)), *others])
     own = places(lamps, np.ones(len(lamps)))
-    return position, lamp_rays.moments(Occluder(mesh), mesh, points, position, normal, own)
+    return position, picture_rays.moments(Occluder(mesh), mesh, points, position, normal, own)
 
 
 def off(got: np.ndarray, expected: np.ndarray) -> float:

@@ -10,8 +10,8 @@ from jaxprt import visibility
 from jaxprt.scene import Part, Scene, Texture, TexturedMaterial
 from jaxprt.scene.mesh import grid_face, join, make_mesh
 from jaxprt.scene.sides import two_sided
-from jaxprt.visibility import Occluder, blocks, lamp_rays, texel_rays
-from jaxprt.visibility.lamp_rays import LampPlaces
+from jaxprt.visibility import Occluder, blocks, picture_rays
+from jaxprt.visibility.picture_rays import LampPlaces
 
 SIZE = 8
 RAMP = np.array([[[0.0], [1.0]]], np.float32)  # opacity 2 u - 1/2, clamped: half of it is in each half of the sheet
@@ -124,14 +124,14 @@ def test_rays_from_pixels_pass_what_rays_of_vertices_pass():
     spot = random.dirichlet([1, 1, 1], count)
     way = np.array([[0, 1, 0], [0.3, 0.8, -0.1]], np.float32)
     way /= np.linalg.norm(way, axis=1, keepdims=True)
-    rays = texel_rays.TexelRays(np.repeat(way[:, None], texel_rays.PLACES, 1), np.array([3, 2]))
-    points = texel_rays.PicturePoints(
+    rays = picture_rays.TexelRays(np.repeat(way[:, None], picture_rays.PLACES, 1), np.array([3, 2]))
+    points = picture_rays.PicturePoints(
         np.arange(count) % 6, spot, np.zeros((count, 2, 3)), *np.divmod(np.arange(count), 9)
     )
     for field in ({"alpha_mode": "mask"}, {"alpha_mode": "blend"}, {"alpha_mode": "blend", "back": "lit"}):
         mesh = two_sided(scene(**field)).mesh
         occluder = Occluder(mesh)
-        share = texel_rays.shares(mesh, occluder, points, rays)
+        share = picture_rays.shares(mesh, occluder, points, rays)
         corner = np.asarray(mesh.position)[np.asarray(mesh.face)[points.triangle]]
         place = np.einsum("pk,pki->pi", spot, corner).astype(np.float32) + np.array([0, 1e-6, 0], np.float32)
         number, texel = np.tile(np.arange(count), 2), np.repeat(np.arange(2), count)
@@ -143,7 +143,7 @@ def test_rays_from_pixels_pass_what_rays_of_vertices_pass():
 
 
 def test_lamps_shine_through_what_lets_light_pass():
-    points = texel_rays.PicturePoints(
+    points = picture_rays.PicturePoints(
         np.array([0]), np.array([[0.2, 0.3, 0.5]]), np.zeros((1, 2, 3)), *np.zeros((2, 1), int)
     )
     lamp = LampPlaces(  # a point light above the left half of the leaf
@@ -157,7 +157,7 @@ def test_lamps_shine_through_what_lets_light_pass():
         mesh = scene(**field).mesh
         corner = np.asarray(mesh.position)[np.asarray(mesh.face)[0]]
         place, up = points.barycentric @ corner, np.array([[0.0, 1, 0]])
-        return lamp_rays.moments(Occluder(mesh), mesh, points, place, up, lamp)[0], place
+        return picture_rays.moments(Occluder(mesh), mesh, points, place, up, lamp)[0], place
 
     open_, place = light(alpha_texture=None, alpha=0.0, alpha_mode="mask")
     assert all(np.any(moment != 0) for moment in open_)

@@ -6,8 +6,8 @@ import pytest
 from jaxprt.scene import light_samples
 from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.sphere import cubemap
-from jaxprt.visibility import Occluder, texel_rays
-from jaxprt.visibility.texel_rays import PicturePoints, TexelRays
+from jaxprt.visibility import Occluder, picture_rays
+from jaxprt.visibility.picture_rays import PicturePoints, TexelRays
 
 SIZE = 8
 
@@ -32,7 +32,7 @@ def rays_up(*, count):
     """Rays to the texels around +y."""
     way = np.asarray(cubemap.direction(size=SIZE)).reshape(-1, 3)
     texel = np.argsort(-way[:, 1])[:4]
-    direction = light_samples.in_texels(texel, np.ones((6, SIZE, SIZE, 1)), size=SIZE, count=texel_rays.PLACES)
+    direction = light_samples.in_texels(texel, np.ones((6, SIZE, SIZE, 1)), size=SIZE, count=picture_rays.PLACES)
     return texel, TexelRays(direction, np.full(len(texel), count))
 
 
@@ -41,14 +41,14 @@ def test_shares_are_those_of_single_rays_to_every_place():
     occluder = Occluder(join([floor, lid]))
     random = np.random.default_rng(0)
     place = random.dirichlet([1, 1, 1], 100)
-    points, (_, rays) = points_on(floor, place), rays_up(count=texel_rays.PLACES)
-    share = texel_rays.shares(floor, occluder, points, rays)
+    points, (_, rays) = points_on(floor, place), rays_up(count=picture_rays.PLACES)
+    share = picture_rays.shares(floor, occluder, points, rays)
     corner = np.asarray(floor.position)[np.asarray(floor.face)[0]]
     start = (place @ corner + [0, 1e-5, 0]).astype(np.float32)
     for texel, direction in enumerate(rays.direction):
         point, way = (each.ravel() for each in np.indices((len(start), len(direction))))
         open_ = 1 - occluder.blocked(start, direction, point, way).reshape(len(start), -1).mean(1)
-        np.testing.assert_allclose(share[texel] / texel_rays.FULL, open_, atol=0.5 / texel_rays.FULL + 1e-6)
+        np.testing.assert_allclose(share[texel] / picture_rays.FULL, open_, atol=0.5 / picture_rays.FULL + 1e-6)
 
 
 def test_an_edge_inside_of_a_pixel_is_seen_by_its_share():
@@ -59,8 +59,8 @@ def test_an_edge_inside_of_a_pixel_is_seen_by_its_share():
     corner = np.asarray(floor.position)[np.asarray(floor.face)[0]]
     beside = place[0] @ corner - [0.25 * step * (corner[0] - corner[1])[0], 0, -2]
     occluder = Occluder(join([floor, make_mesh(np.asarray(lid.position) + beside, np.asarray(lid.face))]))
-    share = texel_rays.shares(floor, occluder, points, rays)
-    np.testing.assert_array_equal(share, round(texel_rays.FULL / 4))
+    share = picture_rays.shares(floor, occluder, points, rays)
+    np.testing.assert_array_equal(share, round(picture_rays.FULL / 4))
 
 
 @pytest.mark.parametrize("bad", ["padding", "no area", "below"])
@@ -73,7 +73,7 @@ def test_points_that_see_nothing_see_nothing(bad):
         floor = make_mesh(np.zeros((4, 3)), np.asarray(floor.face), normal=np.tile([[0.0, 1, 0]], (4, 1)))
     if bad == "below":
         rays = TexelRays(-rays.direction, rays.per_texel)
-    share = texel_rays.shares(floor, Occluder(square(-1, 1, 0.0)), points, rays)
+    share = picture_rays.shares(floor, Occluder(square(-1, 1, 0.0)), points, rays)
     assert not share.any()
 
 

@@ -19,13 +19,13 @@ import numpy as np
 
 from jaxprt.files import images
 from jaxprt.scene.camera import Camera
+from jaxprt.scene.environment import Sun
 from jaxprt.scene.formats import gltf_geometry, gltf_nodes
 from jaxprt.scene.formats.file_parts import split_parts, store_channels
 from jaxprt.scene.formats.gltf_file import HONORED, Document, check_required, damage_named, excerpt, unread_extensions
 from jaxprt.scene.formats.gltf_nodes import Node
 from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.scene import PointLight, Scene, numbered
-from jaxprt.scene.suns import Sun
 
 _HEIGHT = 512  # height of cameras' pictures in pixels
 _WIDEST = 64  # a larger aspect ratio is taken for damage

@@ -97,8 +97,8 @@ def load_scene(
     metal.
 
     Of an OBJ file, this reads the materials of its MTL files: Kd, Ks, Ns, Ke, map_Kd, map_Ke, norm, and the
-    metallic-roughness statements Pr, Pm, map_Pr, map_Pm and Ni. `obj.read_mtl` explains how Phong materials and those of
-    Blender are converted. A single warning names missing MTL files, materials and images and unsupported statements.
+    metallic-roughness statements Pr, Pm, map_Pr, map_Pm and Ni. `obj.read_mtl` explains how Phong materials and those
+    of Blender are converted. A single warning names missing MTL files, materials and images and unsupported statements.
 
     Files of other formats, and OBJ files without materials, become one matte gray part that is named after the file.
     Colors of vertices or faces (PLY, OBJ, OFF) replace the gray, and multiply the base color of materials. They are

@@ -22,7 +22,7 @@ from jaxprt.systems.dynamic import DynamicBrdf
 from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.visibility import members
-from jaxprt.visibility.arguments import PRECOMPUTE
+from jaxprt.visibility.rays import PRECOMPUTE
 
 ALL = "all"  # as many bounces as contribute
 _MEMBERS = 230  # number of vertices of a cluster

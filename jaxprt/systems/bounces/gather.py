@@ -175,9 +175,9 @@ def rays(
         For each region that is hit, its rays. If the corners of a triangle belong to several regions, each of them has
         the ray, with the weights of its own corners.
     """
-    point, texel, corner, barycentric, _ = visibility.hits.hits(occluder, start, normal, size=size)
+    point, texel, corner, barycentric, _ = visibility.rays.hemisphere_hits(occluder, start, normal, size=size)
     way = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)[texel]
-    seen = visibility.hits.front(occluder, frame[:, 2], corner, way)
+    seen = visibility.rays.hits_front(occluder, frame[:, 2], corner, way)
     result = {}
     for number in np.unique(region[corner[seen]]).tolist():
         inside = region[corner] == number

@@ -197,10 +197,12 @@ class PatchJob(visibility.rays.VisibilityJob):
         """One block."""
         part = self.part(block)
         normal = self.frame[part, 2]
-        point, texel, corner, weight, count = visibility.hits.hits(self.rays, self.start[part], normal, size=self.size)
+        point, texel, corner, weight, count = visibility.rays.hemisphere_hits(
+            self.rays, self.start[part], normal, size=self.size
+        )
         share = gather.shares(normal, size=self.size)
         way = np.asarray(cubemap.direction(size=self.size), np.float32).reshape(-1, 3)
-        front = visibility.hits.front(self.rays, self.frame[:, 2], corner, way[texel])
+        front = visibility.rays.hits_front(self.rays, self.frame[:, 2], corner, way[texel])
         patches = int(self.patch.max()) + 1
         place = point[:, None] * patches + self.patch[corner]
         sent = weight * (front * share[point, texel])[:, None]

@@ -30,7 +30,7 @@ from jaxprt.systems.lobe.system import LobeView
 from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.systems.separable import system as separable
 from jaxprt.systems.separable.factorization import check_mark
-from jaxprt.visibility.points import PointVisibility
+from jaxprt.visibility.starts import PointVisibility
 
 _ROUNDED = 1e-4  # tolerance for the sum of weights in single precision
 

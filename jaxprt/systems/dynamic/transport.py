@@ -22,7 +22,7 @@ from jaxprt.systems.dynamic.brdf_set import DynamicBrdf
 from jaxprt.systems.lobe import LobeTransport, pyramid
 from jaxprt.systems.separable import ClusteredTransport, SeparableBrdf
 from jaxprt.visibility import StoredVisibility
-from jaxprt.visibility.arguments import PRECOMPUTE
+from jaxprt.visibility.rays import PRECOMPUTE
 
 _MEMBERS = 230  # number of vertices of a cluster in a large region
 _CLUSTERS = 64  # number of clusters of a smaller region, if each then has at least

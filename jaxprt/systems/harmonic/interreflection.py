@@ -24,7 +24,7 @@ from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, haar, harmonics, rotation
 from jaxprt.systems.harmonic.table import HarmonicBrdf
 from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector, check, check_memory
-from jaxprt.visibility.arguments import PRECOMPUTE
+from jaxprt.visibility.rays import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "bounce": 1}
@@ -203,7 +203,7 @@ class _BounceJob(visibility.rays.VisibilityJob):
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         part = self.part(block)
-        vertex, texel, corner, barycentric, count = visibility.hits.hits(
+        vertex, texel, corner, barycentric, count = visibility.rays.hemisphere_hits(
             self.rays, self.start[part], self.frame[part, 2], size=self.size
         )
         direction = np.asarray(cubemap.direction(size=self.size), np.float32).reshape(-1, 3)
@@ -239,12 +239,12 @@ class _DiffuseBounceJob(visibility.rays.VisibilityJob):
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         part = self.part(block)
-        vertex, texel, corner, barycentric, count = visibility.hits.hits(
+        vertex, texel, corner, barycentric, count = visibility.rays.hemisphere_hits(
             self.rays, self.start[part], self.frame[part, 2], size=self.size
         )
         area = np.asarray(cubemap.vector_area(size=self.size), np.float32).reshape(-1, 3)
         flux = np.sum(self.frame[part][vertex, 2] * area[texel], -1) / np.float32(np.pi)
-        seen = visibility.hits.front(self.rays, self.frame[:, 2], corner, area[texel])
+        seen = visibility.rays.hits_front(self.rays, self.frame[:, 2], corner, area[texel])
         leaving = np.einsum("mk,mkli->mli", barycentric * (seen * flux)[:, None], self.rows[corner])
         total = np.zeros((len(part), *self.rows.shape[1:]), np.float32)
         np.add.at(total, vertex, leaving)

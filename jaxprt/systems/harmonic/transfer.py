@@ -23,7 +23,7 @@ from jaxprt.compile import jit
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar, harmonics, rotation
-from jaxprt.visibility.arguments import PRECOMPUTE
+from jaxprt.visibility.rays import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "harmonic": 1}

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Float32, Int
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.scene import PointLight
 from jaxprt.systems.lamps.transport import LampTransport, sampled
-from jaxprt.visibility.lamp_rays import LampPlaces
+from jaxprt.visibility.picture_rays import LampPlaces
 
 _PLACES = 4096  # places on a surface to which rays may go
 _LEVELS = (64, 256, 1024, _PLACES)  # places whose light is added up, from far lamps to close ones
@@ -96,7 +96,7 @@ def at_points(
     """The transport of lamps to the points of a picture.
 
     Args:
-        moment: The result of `jaxprt.visibility.lamp_rays.moments`. That of spots is changed in place.
+        moment: The result of `jaxprt.visibility.picture_rays.moments`. That of spots is changed in place.
         position: Positions of the points.
         frame: Their shading frames; rows are tangent, bitangent, normal.
         lamps: The lamps.

@@ -28,8 +28,8 @@ from jaxprt.files.arrays import Layout, sketch
 from jaxprt.scene import origin as origins
 from jaxprt.scene.mesh import Mesh, relative
 from jaxprt.scene.scene import PointLight
-from jaxprt.visibility.arguments import PRECOMPUTE
 from jaxprt.visibility.occluder import offsets
+from jaxprt.visibility.rays import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "lamps": 1}

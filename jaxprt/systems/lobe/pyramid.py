@@ -25,7 +25,7 @@ from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap, haar
 from jaxprt.systems.lobe import diffuse
 from jaxprt.visibility import StoredVisibility
-from jaxprt.visibility.arguments import PRECOMPUTE
+from jaxprt.visibility.rays import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "lobe": 2}

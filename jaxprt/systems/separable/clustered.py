@@ -23,8 +23,7 @@ from jaxtyping import Array, Float, Float16, Int, UInt, UInt8
 from jaxprt import require, visibility
 from jaxprt.compile import jit, linear, mapped
 from jaxprt.decompose import eigen
-from jaxprt.files.arrays import Layout, sketch
-from jaxprt.files.mapped import Reference, reference
+from jaxprt.files.arrays import Layout, Reference, reference, sketch
 from jaxprt.sphere import haar
 from jaxprt.systems.separable import sparse
 from jaxprt.systems.separable.factorization import SeparableBrdf, marked

@@ -1,0 +1,174 @@
+"""Rays from the points of pictures to the brightest texels of distant light, and to lamps.
+
+Visibility that is interpolated between vertices has the shadow of a sun wrong where triangles are larger than the edges
+of the shadow. Rays from the points themselves have it right on every mesh. They start at four places of each pixel, so
+that edges are anti-aliased, and go to places within the texel that are drawn by the flux of the light at a finer
+resolution, so that a sun that is smaller than a texel keeps its size. The places of neighboring pixels differ by a
+dither pattern.
+
+What vertices see of a lamp, interpolated, has soft shadows wrong where triangles are larger than the shadows. Here each
+point of a picture has its own integrals, as `jaxprt.systems.lamps.transport` defines them. They are products of two
+factors, for each piece of a lamp:
+
+* The integrals without shadows are sums over places on the lamp. There are more places where a point is close to it.
+* The visible share is that of the irradiance from the places to which rays are traced. Rays start at four places of
+  each pixel, and the places on the lamp differ between neighboring pixels by a dither pattern.
+
+The first factor has no noise, so that light without shadows is smooth (Heitz, Hill and McGuire, "Combining analytic
+direct illumination and stochastic shadows", 2018). Where the first rays of sixteen neighboring points all agree, no
+more are traced; in half-shadows, four times as many.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, Int64, Integer, UInt8
+
+from jaxprt.scene.mesh import Mesh
+from jaxprt.visibility import blocks
+from jaxprt.visibility.occluder import Occluder, offsets
+
+FULL = 255  # share of a texel that is visible completely
+PLACES = 64  # places in each texel
+_PIECE = 1 << 12  # points that a thread traces at a time
+_BAYER = np.array([[0, 2], [3, 1]])
+for _ in range(2):
+    _BAYER = np.block([[4 * _BAYER, 4 * _BAYER + 2], [4 * _BAYER + 3, 4 * _BAYER + 1]])
+_PART = 1 << 10  # points that a thread traces at a time
+
+
+class PicturePoints(NamedTuple):
+    """Points of a picture on the triangles of a mesh.
+
+    Attributes:
+        triangle: Index of the triangle of each point; -1 in padding.
+        barycentric: Barycentric coordinates.
+        slope: Change of the barycentric coordinates from one pixel to the next, to the right and down.
+        row: Row of each point's pixel.
+        column: Column of each point's pixel.
+    """
+
+    triangle: Int[np.ndarray, " p"]
+    barycentric: Float[np.ndarray, "p 3"]
+    slope: Float[np.ndarray, "p 2 3"]
+    row: Integer[np.ndarray, " p"]
+    column: Integer[np.ndarray, " p"]
+
+
+class TexelRays(NamedTuple):
+    """Rays of each point to some texels.
+
+    Attributes:
+        direction: Unit directions of places within each texel, in world space.
+        per_texel: Number of rays of each point to each texel, at most the number of places.
+    """
+
+    direction: Float32[np.ndarray, "t n 3"]
+    per_texel: Integer[np.ndarray, " t"]
+
+
+def shares(mesh: Mesh, occluder: Occluder, points: PicturePoints, rays: TexelRays) -> UInt8[np.ndarray, "t p"]:
+    """Visible share of each texel at each point, in 255ths.
+
+    Directions below the triangle of a point are blocked. Padding, and triangles without an area, see nothing.
+
+    Args:
+        mesh: The mesh of the points.
+        occluder: Geometry that casts shadows.
+        points: The points.
+        rays: Rays to the texels.
+    """
+    from jaxprt.visibility import packets  # numba takes half a second to import
+
+    position = np.asarray(mesh.position, np.float32)
+    face = np.ascontiguousarray(mesh.face, np.int32)
+    surface = position, np.asarray(mesh.normal, np.float32), face, offsets(position, face)
+    drawn = *point_fields(points), dither_pattern(points)
+    middle = rays.direction.mean(1)
+    # Texels start at different places, so that their dither patterns do not add up.
+    first = (np.arange(len(rays.per_texel)) * 37) % PLACES
+    texels = rays.direction, middle, np.asarray(rays.per_texel, np.int64), first
+    share = np.empty((len(rays.per_texel), len(points.triangle)), np.uint8)
+    parts = [slice(i, min(i + _PIECE, share.shape[1])) for i in range(0, share.shape[1], _PIECE)]
+    packed = occluder.from_pixels()
+
+    def trace(part: slice) -> None:
+        packets.trace_shares(packed.query, surface, drawn, texels, part.start, part.stop, share)
+
+    with ThreadPoolExecutor(blocks.cores()) as pool:
+        list(pool.map(trace, parts))
+    return share
+
+
+def point_fields(points: PicturePoints) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Triangles, barycentric coordinates and slopes of points, as the loops over packets take them."""
+    barycentric, slope = (np.ascontiguousarray(each, np.float32) for each in points[1:3])
+    return np.ascontiguousarray(points.triangle, np.int64), barycentric, slope
+
+
+def dither_pattern(points: PicturePoints) -> Int[np.ndarray, " p"]:
+    """Number in the dither pattern of each point's pixel, from 0 to 63."""
+    return _BAYER[points.row % 8, points.column % 8]
+
+
+class LampPlaces(NamedTuple):
+    """Places on lamps, at several levels of detail.
+
+    Places of one level of a lamp stand together, piece by piece. Rays go to those of the last level, which lie on the
+    surface and are ordered by repeated halving, so that any run of them covers one region.
+
+    Attributes:
+        place: Positions of the places, in world units.
+        area: The area that each stands for, times the normal there; zero for a point light.
+        first: Index of the first place of each level k of each lamp n.
+        per_piece: Number of places of each piece at each level; 0 for a level that is not used. The last one always is.
+        pieces: Number of pieces of each lamp.
+        strata: Number of first rays from each point to each lamp. Four times as many are at least one a piece.
+    """
+
+    place: Float32[np.ndarray, "s 3"]
+    area: Float32[np.ndarray, "s 3"]
+    first: Int64[np.ndarray, "n k"]
+    per_piece: Int64[np.ndarray, "n k"]
+    pieces: Int64[np.ndarray, " n"]
+    strata: Int64[np.ndarray, " n"]
+
+
+def moments(
+    occluder: Occluder,
+    mesh: Mesh,
+    points: PicturePoints,
+    position: Float[np.ndarray, "p 3"],
+    normal: Float[np.ndarray, "p 3"],
+    lamps: LampPlaces,
+) -> tuple[Float32[np.ndarray, "m p"], Float32[np.ndarray, "m p"], Float32[np.ndarray, "m 3 p"]]:
+    """Integrals of 1, of the cosine and of the direction over what each point sees of each piece of a lamp.
+
+    Only directions above the horizons of the shading normal and of the triangle count. Padding, and triangles without
+    an area, see nothing.
+
+    Args:
+        occluder: Geometry that casts shadows: all of the mesh.
+        mesh: The mesh of the points.
+        points: The points.
+        position: Their positions.
+        normal: Their shading normals.
+        lamps: Places on the lamps.
+    """
+    from jaxprt.visibility import packets  # numba takes half a second to import
+
+    surface = occluder.position, np.asarray(mesh.normal, np.float32), occluder.face, occluder.offset
+    drawn = *point_fields(points), dither_pattern(points)
+    fields = tuple(np.ascontiguousarray(each, np.float32) for each in (position, normal))
+    size = int(lamps.pieces.sum()), len(position)
+    result = np.empty(size, np.float32), np.empty(size, np.float32), np.empty((size[0], 3, size[1]), np.float32)
+    parts = [slice(i, min(i + _PART, len(position))) for i in range(0, len(position), _PART)]
+    packed = occluder.from_pixels()
+
+    def trace(part: slice) -> None:
+        packets.trace_lamps(packed.query, surface, drawn, fields, tuple(lamps), part.start, part.stop, result)
+
+    with ThreadPoolExecutor(blocks.cores()) as pool:
+        list(pool.map(trace, parts))
+    return result
