@@ -62,9 +62,9 @@ def read_header(path: Path, shape: tuple[int, ...], dtype: str) -> int:
         version = np.lib.format.read_magic(file)
         if version != _VERSION:
             raise ValueError(f"{path} must have version {_VERSION} of NumPy's format, got {version}")
-        found, fortran, kind = np.lib.format.read_array_header_1_0(file)
-        if (found, fortran, kind) != (tuple(shape), False, np.dtype(dtype)):
-            raise ValueError(f"{path} must be {dtype} {list(shape)}, got {kind} {list(found)}")
+        stored, fortran, kind = np.lib.format.read_array_header_1_0(file)
+        if (stored, fortran, kind) != (tuple(shape), False, np.dtype(dtype)):
+            raise ValueError(f"{path} must be {dtype} {list(shape)}, got {kind} {list(stored)}")
         return file.tell()
 
 
@@ -121,10 +121,10 @@ def reference(array: np.ndarray) -> np.ndarray | Reference:
 
     Returns the array itself if it is not a memory map, or if its file has been deleted or replaced.
     """
-    found = _maps.get(array.ctypes.data) if array.size and array.flags.c_contiguous else None
-    if found is None:
+    mapping = _maps.get(array.ctypes.data) if array.size and array.flags.c_contiguous else None
+    if mapping is None:
         return array
-    path, offset, file = found
+    path, offset, file = mapping
     try:
         status = os.stat(path)
     except OSError:
@@ -206,7 +206,7 @@ class BlockStore:
         if not self.path.exists():
             _create(self.path, {**header, "near": near}, files)
         self._key = _open(self.path, header, near)
-        self._offset = {name: _offset(self.path, name, *each) for name, each in files.items()}
+        self._offset = {name: _offset(self.path, name, *form) for name, form in files.items()}
 
     @property
     def here(self) -> bool:
@@ -251,8 +251,8 @@ class BlockStore:
             if value[name].shape != at.shape:
                 raise ValueError(f"{name} must have blocks of {list(at.shape)}, got {list(value[name].shape)}")
         try:
-            for name, each in value.items():
-                self._put(name, block, each)
+            for name, rows in value.items():
+                self._put(name, block, rows)
             self._put(_CHECKSUM, block, np.array(self._checksum(block, value), np.uint32))
         except OSError as error:
             if error.errno not in _FULL:
@@ -275,16 +275,16 @@ class BlockStore:
 
     def written(self) -> np.ndarray:
         """Mask of the blocks that have a checksum. Only `read` verifies it."""
-        found = np.zeros(self._blocks, np.uint32)
+        sums = np.zeros(self._blocks, np.uint32)
         try:
             with (self.path / f"{_CHECKSUM}.npy").open("rb") as file:
                 file.seek(self._offset[_CHECKSUM])
-                data = file.read(found.nbytes)
+                data = file.read(sums.nbytes)
                 there = np.frombuffer(data[: len(data) // 4 * 4], np.uint32)
         except OSError:
-            return found > 0
-        found[: len(there)] = there
-        return found > 0
+            return sums > 0
+        sums[: len(there)] = there
+        return sums > 0
 
     def whole(self, name: str, count: int) -> np.ndarray:
         """A whole array, cut to `count` entries along its block axis. All blocks must have been found by `read`.
@@ -300,8 +300,8 @@ class BlockStore:
         result = empty((*at.shape[: at.axis], count, *at.shape[at.axis + 1 :]), at.dtype)
         for block in range(self._blocks):
             first = block * size
-            found = self._get(name, block, at.shape, at.dtype)
-            result[(*before, slice(first, first + size))] = found[(*before, slice(count - first))]
+            values = self._get(name, block, at.shape, at.dtype)
+            result[(*before, slice(first, first + size))] = values[(*before, slice(count - first))]
         return result
 
     def _checksum(self, block: int, array: Mapping[str, np.ndarray]) -> int:
@@ -379,29 +379,29 @@ def _create(path: Path, header: Mapping[str, Any], files: Mapping[str, tuple[tup
 def _open(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]) -> str:
     """Refuses a store of other inputs. Returns the key of the store."""
     try:
-        found = _found(path)
+        stored = _found(path)
     except Exception as error:
         raise ValueError(
             f"{path} exists but is not a readable store of arrays, or is damaged ({error}); name another path"
         ) from error
-    if found.get("format") != _FORMAT:
+    if stored.get("format") != _FORMAT:
         raise ValueError(f"{path} exists but is not a store that jaxprt wrote; name another path")
-    if found.get("version") != VERSION:
-        raise ValueError(f"{path} has format version {found.get('version')}, this package writes {VERSION}; delete it")
-    before, now = found.get("algorithm"), header.get("algorithm")
-    if before != now and found.get("system") == header.get("system"):
+    if stored.get("version") != VERSION:
+        raise ValueError(f"{path} has format version {stored.get('version')}, this package writes {VERSION}; delete it")
+    before, now = stored.get("algorithm"), header.get("algorithm")
+    if before != now and stored.get("system") == header.get("system"):
         raise ValueError(
             f"{path} was made by version {before} of the algorithm, this package has version {now}, which gives other "
             "results; delete it or name another path"
         )
-    differ = [key for key in header if found.get(key) != header[key]]
+    differ = [key for key in header if stored.get(key) != header[key]]
     if differ:
-        told = "; ".join(f"{key}: stored {str(found.get(key))[:200]}, now {header[key]}" for key in differ)
+        told = "; ".join(f"{key}: stored {str(stored.get(key))[:200]}, now {header[key]}" for key in differ)
         raise ValueError(
             f"{path} holds arrays that were computed from other inputs ({told}); name another path or delete it"
         )
-    _check_near(path, found.get("near", {}), near)
-    key = found.get("key")
+    _check_near(path, stored.get("near", {}), near)
+    key = stored.get("key")
     if not (isinstance(key, str) and re.fullmatch("[0-9a-f]{32}", key)):
         raise ValueError(f"{path} is damaged: its key must be 32 hexadecimal digits, got {str(key)[:80]}; delete it")
     return key
@@ -443,19 +443,19 @@ def _offset(path: Path, name: str, shape: tuple[int, ...], dtype: str) -> int:
         ) from error
 
 
-def _check_near(path: Path, found: Any, near: Mapping[str, list[float]]) -> None:
+def _check_near(path: Path, stored: Any, near: Mapping[str, list[float]]) -> None:
     """Refuses a store whose input arrays differ from these by more than rounding."""
-    if not isinstance(found, Mapping) or sorted(found) != sorted(near):
-        told = sorted(found) if isinstance(found, Mapping) else found
+    if not isinstance(stored, Mapping) or sorted(stored) != sorted(near):
+        told = sorted(stored) if isinstance(stored, Mapping) else stored
         raise ValueError(f"{path} is damaged: it must have sketches of {sorted(near)}, got {told}; delete it")
     for name, now in near.items():
-        kept = found[name]
-        numbers = isinstance(kept, list) and all(type(x) in (int, float) and abs(x) < _MOST for x in kept)
-        if not (numbers and len(kept) == len(now)):
+        before = stored[name]
+        numbers = isinstance(before, list) and all(type(x) in (int, float) and abs(x) < _MOST for x in before)
+        if not (numbers and len(before) == len(now)):
             raise ValueError(f"{path} is damaged: the sketch of {name} must have {len(now)} numbers; delete it")
     for name, now in near.items():
-        norm = max(now[1], found[name][1])
-        distance = float(np.linalg.norm(np.subtract(now[2:], found[name][2:])))
+        norm = max(now[1], stored[name][1])
+        distance = float(np.linalg.norm(np.subtract(now[2:], stored[name][2:])))
         if not distance <= now[0] * norm:
             raise ValueError(
                 f"{path} holds arrays that were computed from other inputs ({name}: stored and given values differ by "

@@ -456,8 +456,8 @@ def save(path: str | os.PathLike, object: Any) -> None:
     shutil.rmtree(aside, ignore_errors=True)
     try:
         aside.mkdir(parents=True)
-        for number, (_, each) in enumerate(arrays):
-            stored = storable(each)
+        for number, (_, array) in enumerate(arrays):
+            stored = storable(array)
             with (aside / f"{number}.npy").open("xb") as file:
                 write_header(file, stored.shape, stored.dtype.str)
                 file.write(stored.reshape(-1).view(np.uint8).data)
@@ -498,8 +498,8 @@ def reduced(object: Any) -> tuple:
     Args:
         object: A dataclass or Module of this package.
     """
-    field = {each.name: getattr(object, each.name) for each in dataclasses.fields(object)}
-    name = {key: found for key, value in field.items() if (found := function_name(value)) is not None}
+    field = {item.name: getattr(object, item.name) for item in dataclasses.fields(object)}
+    name = {key: text for key, value in field.items() if (text := function_name(value)) is not None}
     return _restored, (type(object), {key: value for key, value in field.items() if key not in name}, name)
 
 

@@ -240,12 +240,12 @@ def _numbers(flag: Bool[Array, " n"] | UInt8[Array, " n"], block: int) -> list[I
     """Indices of the set flags in order, then -1: in blocks, or inside of jax.jit in one block of n."""
     if isinstance(flag, Tracer):
         place = jnp.where(flag > 0, jnp.cumsum(flag > 0, dtype=jnp.int32) - 1, flag.size)
-        every = jnp.arange(flag.size, dtype=jnp.int32)
-        return [jnp.full(flag.size, -1, jnp.int32).at[place].set(every, mode="drop")]
+        index = jnp.arange(flag.size, dtype=jnp.int32)
+        return [jnp.full(flag.size, -1, jnp.int32).at[place].set(index, mode="drop")]
     number = np.flatnonzero(np.asarray(flag)).astype(np.int32)
     blocks = max(-(-len(number) // block), 1)
     number = np.pad(number, (0, blocks * block - len(number)), constant_values=-1)
-    return [jax.device_put(each) for each in number.reshape(-1, block)]
+    return [jax.device_put(row) for row in number.reshape(-1, block)]
 
 
 def _joined(parts: list[tuple[Array, ...]]) -> list[Any]:
@@ -255,8 +255,8 @@ def _joined(parts: list[tuple[Array, ...]]) -> list[Any]:
     count = sum(int(np.count_nonzero(np.asarray(part[0]) >= 0)) for part in parts)
     unit = 1 << max(count.bit_length() - 4, 0)
     room = max(-(-count // unit) * unit, 1)
-    field = (np.concatenate([np.asarray(each) for each in same]) for same in zip(*parts, strict=True))
-    return [each[:room] for each in field]
+    field = (np.concatenate([np.asarray(values) for values in same]) for same in zip(*parts, strict=True))
+    return [values[:room] for values in field]
 
 
 # The following is split into several programs, because XLA would fuse all computations of one program into each of its
@@ -273,12 +273,12 @@ def _uniform(fragments: Fragments, facing: Bool[Array, " f"], uneven: Bool[Array
     height, width, *_ = fragments.triangle.shape
     triangle = fragments.triangle.reshape(height * width, -1).T
     shown = facing[triangle] & (triangle >= 0)
-    same = functools.reduce(jnp.logical_and, [each == triangle[0] for each in triangle])
+    same = functools.reduce(jnp.logical_and, [sample == triangle[0] for sample in triangle])
     same &= ~uneven[triangle[0]] | (len(triangle) == 1)
     mixed = ~same & functools.reduce(jnp.logical_or, list(shown))
     whole = jnp.where(same & shown[0], (1 << len(triangle)) - 1, 0).astype(jnp.uint8)
     members = jnp.pad(whole[:, None], ((0, 0), (0, len(triangle) - 1)))
-    empty = functools.reduce(jnp.add, [(each < 0).astype(fragments.depth.dtype) for each in triangle])
+    empty = functools.reduce(jnp.add, [(sample < 0).astype(fragments.depth.dtype) for sample in triangle])
     return members, mixed, (empty / len(triangle)).reshape(height, width)
 
 
@@ -300,17 +300,17 @@ def _faces(mesh: Mesh, projected: Float[Array, "3 v"]):
     s = jnp.sign(q)
     value, right, down = _affine(x - s * s[0] * x[0], y - s * s[0] * y[0], q)
     area = sum(value[i] * s[i] for i in range(3))
-    scale = [jnp.where(area == 0, 0, jnp.abs(each) / jnp.where(area == 0, 1, area)) for each in q]
+    scale = [jnp.where(area == 0, 0, jnp.abs(component) / jnp.where(area == 0, 1, area)) for component in q]
     change = [sum(part[i] * scale[i] for i in range(3)) for part in (right, down)]
-    return mesh.region[face[0]], *(each[0] + each[1] + each[2] for each in normal), *change
+    return mesh.region[face[0]], *(component[0] + component[1] + component[2] for component in normal), *change
 
 
 @jit
 def _samples(row: Int[Array, " m"], fragments: Fragments, face: tuple[Array, ...]):
     """Whether samples of some pixels see a front, and the values that `_same` compares, as arrays [s, m]."""
     shape = (fragments.depth.shape[0] * fragments.depth.shape[1], -1)
-    triangle, depth = (each.reshape(shape)[row].T for each in (fragments.triangle, fragments.depth))
-    facing, *rest = (each[triangle] for each in face)
+    triangle, depth = (values.reshape(shape)[row].T for values in (fragments.triangle, fragments.depth))
+    facing, *rest = (values[triangle] for values in face)
     return facing & (triangle >= 0), (triangle, 1 / depth, *rest)
 
 
@@ -344,9 +344,9 @@ def _merge(row: Int[Array, " m"], members: UInt8[Array, "n s"], shown, same) -> 
         for i in reversed(range(j)):
             leader = jnp.where(same[i, j] & (first[i] == i), i, leader)
         first.append(jnp.where(shown[j], leader, -1))
-    each = [sum((first[j] == i) << j for j in range(i, len(first))) for i in range(len(first))]
+    sets = [sum((first[j] == i) << j for j in range(i, len(first))) for i in range(len(first))]
     row = jnp.where(row < 0, len(members), row)
-    return members.at[row].set(jnp.stack(each, -1).astype(members.dtype), mode="drop")
+    return members.at[row].set(jnp.stack(sets, -1).astype(members.dtype), mode="drop")
 
 
 @jit
@@ -369,7 +369,7 @@ def _points(
     pixel = jnp.where(used, sample // samples, height * width - 1)
     triangle = jnp.where(used, fragments.triangle.ravel()[sample], -1)
     member = jnp.where(used, members.ravel()[sample], 0)
-    middle, coverage = (jnp.asarray(each, dtype)[member] for each in _subsets(samples))
+    middle, coverage = (jnp.asarray(table, dtype)[member] for table in _subsets(samples))
     start = jnp.asarray(SAMPLES[samples], dtype)[sample % samples]
     vertex = face[jnp.maximum(triangle, 0)].T
     x, y, q = jax.lax.map(lambda axis: axis[vertex], projected)
@@ -385,9 +385,9 @@ def _shared(sample: Int[Array, " p"], members: UInt8[Array, "n s"], share: Float
     samples = members.shape[1]
     used, sample = sample >= 0, jnp.maximum(sample, 0)
     member = jnp.where(used, members.ravel()[sample], 0)
-    own = share.reshape(-1, samples, *share.shape[3:])[sample // samples]
+    shares = share.reshape(-1, samples, *share.shape[3:])[sample // samples]
     member = member.reshape(-1, *(1,) * (share.ndim - 3))
-    bits = [jnp.where((member >> number) & 1, own[:, number], 0) for number in range(samples)]
+    bits = [jnp.where((member >> number) & 1, shares[:, number], 0) for number in range(samples)]
     return functools.reduce(jnp.add, bits) / samples
 
 
@@ -423,14 +423,14 @@ def _weights(value, right, down, across, along):
     weight = [jnp.maximum(value[i] + reach * change[i], 0) for i in range(3)]
     total = sum(weight)
     rate = jnp.where(total > 0, 1 / jnp.where(total > 0, total, 1), 0)
-    return [jnp.where(total > 0, each * rate, 1 / 3) for each in weight], rate
+    return [jnp.where(total > 0, term * rate, 1 / 3) for term in weight], rate
 
 
 @jit
 def _packed(triangle: Int[Array, " p"], weight, rate, *change) -> tuple[Float[Array, "p 3"], Float[Array, "p 2 3"]]:
     """Barycentric coordinates and their slopes; zero in padding."""
     slope = [[(part[i] - weight[i] * sum(part)) * rate for i in range(3)] for part in change]
-    slope = jnp.stack([jnp.stack(each, -1) for each in slope], 1)
+    slope = jnp.stack([jnp.stack(component, -1) for component in slope], 1)
     used = (triangle >= 0)[:, None]
     slope = jnp.where(used[..., None], jnp.clip(slope, -STEEPEST, STEEPEST), 0)
     return jnp.where(used, jnp.stack(weight, -1), 0), slope
@@ -478,10 +478,10 @@ def visible_points(
     slots = _slots(mesh, camera, samples, hidden, occluder)
     result = []
     for triangle, depth, share in slots:
-        triangle, depth = (each[..., 0] if samples == 1 else each for each in (triangle, depth))
+        triangle, depth = (values[..., 0] if samples == 1 else values for values in (triangle, depth))
         fragments = Fragments(jnp.asarray(triangle), None, jnp.asarray(depth))
-        found = shading_points(fragments, mesh, camera, uneven=uneven, share=jnp.asarray(share))
-        result.append(finished(found, between))
+        points = shading_points(fragments, mesh, camera, uneven=uneven, share=jnp.asarray(share))
+        result.append(finished(points, between))
     return _join_points(result)
 
 
@@ -562,17 +562,17 @@ def _slots(
     away = np.zeros(len(mesh.face), bool) if hidden is None else _hidden_now(mesh, camera, hidden)
     opaque = dataclasses.replace(mesh, face=np.where((clear | away)[:, None], 0, np.asarray(mesh.face)))
     base = raster.rasterize(opaque, camera, samples=samples)
-    behind = [np.asarray(each).reshape(-1) for each in (base.triangle, base.depth)]
+    behind = [np.asarray(values).reshape(-1) for values in (base.triangle, base.depth)]
     shape = (camera.height, camera.width, samples)
     chunks = []
     for first in range(0, len(behind[0]), _RAYS):
-        own = slice(first, first + _RAYS)
-        direction = _directions(camera, samples, np.arange(len(behind[0]))[own])
-        far = np.minimum(behind[1][own], 1e30).astype(np.float32)
+        span = slice(first, first + _RAYS)
+        direction = _directions(camera, samples, np.arange(len(behind[0]))[span])
+        far = np.minimum(behind[1][span], 1e30).astype(np.float32)
         eye = np.asarray(camera.eye, np.float32)
         number, face, place, alpha = occluder.translucent.layers(eye, direction, far, away[:count])
         pair = np.where(glass[layer[face]], 1, alpha), (1 - alpha)[..., None] * passing[face]
-        chunks.append(_chunk(number, face, place, *pair, behind[0][own], behind[1][own]))
+        chunks.append(_chunk(number, face, place, *pair, behind[0][span], behind[1][span]))
     most = max(len(chunk[0]) for chunk in chunks)
     nothing = -1, np.inf, 0
     columns = []

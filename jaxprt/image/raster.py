@@ -76,8 +76,8 @@ class Narrow(eqx.Module):
 
         def one(nearest, k):
             place, depth = pixel(k)
-            each = jax.lax.complex(depth, number.astype(depth.dtype))
-            return nearest.at[place].min(each, mode="promise_in_bounds"), None
+            key = jax.lax.complex(depth, number.astype(depth.dtype))
+            return nearest.at[place].min(key, mode="promise_in_bounds"), None
 
         # A scan, because XLA would otherwise recompute the values of a patch for each of its pixels.
         return Narrow(jax.lax.scan(one, self.nearest, jnp.arange(count, dtype=jnp.int32))[0])
@@ -116,9 +116,9 @@ class Wide(eqx.Module):
         place, depth = jax.vmap(pixel)(jnp.arange(count, dtype=jnp.int32))
         bits = self.bits.at[place].min(_bits(depth), mode="promise_in_bounds")
         most = jnp.iinfo(jnp.int32).max
-        kept = jnp.where(bits < self.bits, most, self.number)  # the previous nearest triangle is hidden
+        hidden = jnp.where(bits < self.bits, most, self.number)  # the previous nearest triangle is hidden
         wins = jnp.isfinite(depth) & (_bits(depth) == bits[place])
-        return Wide(bits, kept.at[place].min(jnp.where(wins, number, most), mode="promise_in_bounds"))
+        return Wide(bits, hidden.at[place].min(jnp.where(wins, number, most), mode="promise_in_bounds"))
 
 
 def _bits(depth: Float[Array, "*n"]) -> Int[Array, "*n"]:
@@ -203,13 +203,13 @@ def front_faces(mesh: Mesh, camera: Camera) -> Bool[Array, " f"]:
     vertex = jnp.concatenate([mesh.position - camera.eye, mesh.normal], -1)
     x, y, z, *normal = jax.lax.map(lambda axis: axis[mesh.face.T], vertex.T)
     middle, edge, other = (
-        [op(each) for each in (x, y, z)] for op in (sum, lambda c: c[1] - c[0], lambda c: c[2] - c[0])
+        [op(coordinate) for coordinate in (x, y, z)] for op in (sum, lambda c: c[1] - c[0], lambda c: c[2] - c[0])
     )
     plane = [edge[i - 2] * other[i - 1] - edge[i - 1] * other[i - 2] for i in range(3)]
     side = sum(plane[i] * sum(normal[i]) for i in range(3))
     distance = -sum(plane[i] * middle[i] for i in range(3))
     # Rounding may flip triangles that are seen edge-on.
-    plain = EDGE_ON * jnp.sqrt(sum(each**2 for each in plane) * sum(each**2 for each in middle))
+    plain = EDGE_ON * jnp.sqrt(sum(component**2 for component in plane) * sum(component**2 for component in middle))
     return (jnp.sign(side) * distance >= -plain) | (side == 0)
 
 

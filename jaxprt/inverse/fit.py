@@ -55,7 +55,7 @@ def light(
     first, unravel = solve.raveled(start, steps)
     if not (isinstance(error, float | int | np.number) and 0 < error < np.inf):
         raise ValueError(f"the error must be a positive number, got {error!r}")
-    low, high = (solve.bound(each, start, none) for each, none in ((lower, -np.inf), (upper, np.inf)))
+    low, high = (solve.bound(limits, start, none) for limits, none in ((lower, -np.inf), (upper, np.inf)))
     solve.check(first, low, high)
     if prior is not None:
         _check_prior(prior, unravel, first)
@@ -104,7 +104,7 @@ def material(
     if len(first) > solve.DENSE:
         required = f"at most {solve.DENSE} parameters can be fitted by this method"
         raise ValueError(f"{required}, got {len(first)}: use light for more")
-    low, high = (solve.bound(each, start, none) for each, none in ((lower, -np.inf), (upper, np.inf)))
+    low, high = (solve.bound(limits, start, none) for limits, none in ((lower, -np.inf), (upper, np.inf)))
     solve.check(first, low, high)
     free, bounded, pinned = solve.freed(first, low, high)
 
@@ -149,19 +149,21 @@ def jointly(
     _check(radiance, pixels)
     if not isinstance(start, tuple | list) or len(start) != 2:
         raise TypeError(f"the start must be a light and a material, a pair, got {type(start).__name__}")
-    dark, made = start
-    first = light(lambda each, eye: radiance(each, made, eye), dark, pixels)
-    (lit, of_light), (own, of_material) = solve.raveled(first.value, steps), solve.raveled(made, steps)
-    if len(lit) + len(own) > solve.DENSE:
+    dark, surface = start
+    first = light(lambda trial, eye: radiance(trial, surface, eye), dark, pixels)
+    (lit, of_light), (parameters, of_material) = solve.raveled(first.value, steps), solve.raveled(surface, steps)
+    if len(lit) + len(parameters) > solve.DENSE:
         required = f"light and material may have at most {solve.DENSE} parameters together"
-        raise ValueError(f"{required}, got {len(lit)} and {len(own)}")
-    norm, found = (float(jnp.linalg.norm(each)) for each in (solve.raveled(dark, steps)[0], lit))
-    if not (norm > 0 and found > 0):
-        raise ValueError(f"the light must not be black, got norm {norm} at the start and {found} after the first fit")
-    low, high = (solve.bound(each, made, none) for each, none in ((lower, -np.inf), (upper, np.inf)))
-    solve.check(own, low, high)
-    free, bounded, pinned = solve.freed(own, low, high)
-    size = norm if scale else found
+        raise ValueError(f"{required}, got {len(lit)} and {len(parameters)}")
+    norm, brightness = (float(jnp.linalg.norm(vector)) for vector in (solve.raveled(dark, steps)[0], lit))
+    if not (norm > 0 and brightness > 0):
+        raise ValueError(
+            f"the light must not be black, got norm {norm} at the start and {brightness} after the first fit"
+        )
+    low, high = (solve.bound(limits, surface, none) for limits, none in ((lower, -np.inf), (upper, np.inf)))
+    solve.check(parameters, low, high)
+    free, bounded, pinned = solve.freed(parameters, low, high)
+    size = norm if scale else brightness
 
     def whole(u: Array) -> Array:
         return jnp.concatenate([size * u[: len(lit)], bounded(u[len(lit) :])])
@@ -178,7 +180,7 @@ def jointly(
         return jnp.append(left, held) if scale else left
 
     return solve.marquardt(
-        function, jnp.concatenate([lit / found, free]), whole, at_bounds, unravel, steps, held=int(scale)
+        function, jnp.concatenate([lit / brightness, free]), whole, at_bounds, unravel, steps, held=int(scale)
     )
 
 
@@ -195,6 +197,6 @@ def _check_prior(prior: Callable, unravel: Callable, first: Array) -> None:
     """Refuses a prior that is not one number."""
     if not callable(prior):
         raise TypeError(f"the prior must be a function, got {type(prior).__name__}")
-    found = jax.eval_shape(lambda x: prior(unravel(x)), first)
-    if getattr(found, "shape", None) != () or not jnp.issubdtype(found.dtype, jnp.floating):
-        raise ValueError(f"the prior must be one number of floating point, got {found}")
+    result = jax.eval_shape(lambda x: prior(unravel(x)), first)
+    if getattr(result, "shape", None) != () or not jnp.issubdtype(result.dtype, jnp.floating):
+        raise ValueError(f"the prior must be one number of floating point, got {result}")

@@ -121,16 +121,16 @@ def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
     solve.outside(mesh, pictures)
     if not pictures:
         raise ValueError("at least one picture is needed, got none")
-    parts = [_seen(number, mesh, each) for number, each in enumerate(pictures)]
-    colors = {each.image.shape[2] for each in pictures}
+    parts = [_seen(number, mesh, picture) for number, picture in enumerate(pictures)]
+    colors = {picture.image.shape[2] for picture in pictures}
     if len(colors) > 1:
         raise ValueError(f"all pictures must have the same number of colors, got {sorted(colors)}")
-    vertex, weight, value = (np.concatenate(each) for each in zip(*parts, strict=True))
+    vertex, weight, value = (np.concatenate(rows) for rows in zip(*parts, strict=True))
     if not len(value):
         raise ValueError("pictures must show the mesh in a pixel that counts, got none")
     if not np.any(value):
         raise ValueError("pictures must not be black wherever they count")
-    eye = jnp.stack([each.camera.local(mesh.origin).eye for each in pictures])
+    eye = jnp.stack([picture.camera.local(mesh.origin).eye for picture in pictures])
     return Pixels(eye, jax.device_put(vertex), jax.device_put(weight), jax.device_put(value), len(mesh.position))
 
 
@@ -208,8 +208,8 @@ def residual(radiance: Callable, parameters: PyTree, pixels: Pixels) -> Float[Ar
         got = list(color.shape[1:]) if hasattr(color, "shape") else type(color).__name__
         raise ValueError(f"the radiance must be {list(required[1:])}, vertices and colors of the pictures, got {got}")
     color = color.reshape(-1, color.shape[-1])
-    made = sum(pixels.weight[:, i, None] * color[pixels.vertex[:, i]] for i in range(3))
-    return ((made - pixels.value) / jnp.linalg.norm(pixels.value)).ravel()
+    predicted = sum(pixels.weight[:, i, None] * color[pixels.vertex[:, i]] for i in range(3))
+    return ((predicted - pixels.value) / jnp.linalg.norm(pixels.value)).ravel()
 
 
 class Residual(eqx.Module):

@@ -44,9 +44,9 @@ def raveled(start: PyTree, steps: int) -> tuple[Array, Callable]:
     if steps < 1:
         raise ValueError(f"steps must be at least 1, got {steps}")
     outside(start)
-    for each in jax.tree.leaves(start):
-        if not isinstance(each, jax.Array | np.ndarray | np.generic | float | int) or isinstance(each, bool):
-            raise TypeError(f"the start must be arrays and numbers, in a pytree, got a {type(each).__name__}")
+    for leaf in jax.tree.leaves(start):
+        if not isinstance(leaf, jax.Array | np.ndarray | np.generic | float | int) or isinstance(leaf, bool):
+            raise TypeError(f"the start must be arrays and numbers, in a pytree, got a {type(leaf).__name__}")
     start = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), start)
     first, unravel = ravel_pytree(start)
     if not first.size:
@@ -57,7 +57,7 @@ def raveled(start: PyTree, steps: int) -> tuple[Array, Callable]:
 
 def outside(*values: PyTree) -> None:
     """Refuses a call inside `jax.jit` or another transformation, where values are not known."""
-    traced = any(isinstance(each, Tracer) for each in jax.tree.leaves(values))
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
     if traced or isinstance(jnp.zeros(()) + 0, Tracer):
         raise TypeError(
             "a fit needs concrete values: call it outside of jax.jit, jax.vmap and jax.grad, got traced arrays"
@@ -67,15 +67,15 @@ def outside(*values: PyTree) -> None:
 def bound(bound: PyTree, start: PyTree, none: float) -> np.ndarray:
     """The bound of each number, given as one number, a pytree like the start, or None, which may replace a leaf."""
     outside(bound)
-    (bounds, made), (values, whole) = (jax.tree.flatten(each, is_leaf=lambda x: x is None) for each in (bound, start))
-    if made != whole:
-        if not jax.tree_util.treedef_is_leaf(made):
-            raise ValueError(f"bounds must be one number, or made like the start, {whole}, got {made}")
+    (bounds, form), (values, whole) = (jax.tree.flatten(tree, is_leaf=lambda x: x is None) for tree in (bound, start))
+    if form != whole:
+        if not jax.tree_util.treedef_is_leaf(form):
+            raise ValueError(f"bounds must be one number, or made like the start, {whole}, got {form}")
         bounds = bounds * len(values)
     parts = []
-    for each, value in zip(bounds, values, strict=True):
+    for limit, value in zip(bounds, values, strict=True):
         shape = np.shape(value) if value is not None else (0,)
-        number = np.asarray(none if each is None else each)
+        number = np.asarray(none if limit is None else limit)
         if number.dtype.kind not in "iuf" or (number.shape != shape and number.ndim):
             raise ValueError(
                 f"a bound must be a number, None, or an array like what it bounds, {list(shape)}, got "
@@ -197,9 +197,9 @@ def _scores(axis: np.ndarray, value: np.ndarray, rows: np.ndarray, left: np.ndar
     along, count = axis.T @ rows, min(_BLOCKS, len(left))
     whole, blocks = np.diag(value**2), []
     for part in np.array_split(np.arange(len(left)), count):
-        own = along[:, part]
-        without = whole * (1 + _ROUNDED) - own @ own.T  # Never singular, also where one block determines all.
-        blocks.append(np.linalg.solve(without, own @ left[part]))
+        local = along[:, part]
+        without = whole * (1 + _ROUNDED) - local @ local.T  # Never singular, also where one block determines all.
+        blocks.append(np.linalg.solve(without, local @ left[part]))
     moved = np.stack(blocks, 1) * np.sqrt((count - 1) / count)
     least = np.linalg.norm(left) / np.sqrt(max(1, len(left) - len(value))) / value  # of independent noise
     size = np.linalg.norm(moved, axis=1)
@@ -216,7 +216,7 @@ def _deviation(axis: np.ndarray, scores: np.ndarray) -> np.ndarray:
 
 def _finite(*arrays: Array) -> None:
     outside(arrays)
-    if not all(np.isfinite(each).all() for each in arrays):
+    if not all(np.isfinite(array).all() for array in arrays):
         raise ValueError(
             "the radiance at the start (or prior), and its derivatives, must be finite, got NaN or infinities"
         )
@@ -242,15 +242,15 @@ def at_once(function: Callable, first: Array, unravel: Callable, error: float) -
         keep = best[: np.max(np.flatnonzero(good), initial=-1) + 1]
         axis, value, part = axis[:, keep], value[keep], part[keep]
     scores = _scores(axis, value, rows, before + axis @ part @ rows)
-    found = first + jnp.asarray(axis @ part, first.dtype)
-    left, expected = float(np.linalg.norm(_slopes(function, found)[0])), np.linalg.norm(before + axis @ part @ rows)
+    solution = first + jnp.asarray(axis @ part, first.dtype)
+    left, expected = float(np.linalg.norm(_slopes(function, solution)[0])), np.linalg.norm(before + axis @ part @ rows)
     if not abs(left - expected) < _LINEAR * np.linalg.norm(before):
         raise ValueError(
             f"the radiance must be linear in the light: the residual should be {expected:.3g}, and is {left:.3g}; "
             "other functions can be fitted by material"
         )
     deviation = jnp.asarray(_deviation(axis, scores), first.dtype)
-    return Fit(unravel(found), np.array([np.linalg.norm(before), left]), unravel(deviation), axis.T)
+    return Fit(unravel(solution), np.array([np.linalg.norm(before), left]), unravel(deviation), axis.T)
 
 
 _product = jit(jnp.vdot)
@@ -308,7 +308,7 @@ def marquardt(
     history, still, refused = [float(jnp.linalg.norm(state.residual))], 0, 0
     for _ in range(steps if np.any(np.asarray(state.jac)) else 0):  # A flat objective has no steps.
         moved, tried = update(free, state, *both(free + direction(free, state)))
-        if not all(np.isfinite(each).all() for each in (moved, tried.residual, tried.jac)):
+        if not all(np.isfinite(values).all() for values in (moved, tried.residual, tried.jac)):
             grow = state.increase_factor
             tried = state._replace(
                 damping_factor=state.damping_factor * grow, increase_factor=2 * grow, delta=tried.delta
@@ -336,7 +336,7 @@ def marquardt(
 def _units(back: Callable, count: int, dtype) -> tuple[Array, Array]:
     """Squared norms of the Jacobian's columns, estimated by random signs, and the parameters' units: inverse roots."""
     probe = jax.random.rademacher(jax.random.key(0), (_PROBES, count), dtype)
-    square = jnp.mean(jax.lax.map(lambda each: back(each)[0] ** 2, probe), 0)
+    square = jnp.mean(jax.lax.map(lambda vector: back(vector)[0] ** 2, probe), 0)
     whole = jnp.max(square)
     return square, 1 / jnp.sqrt(square + _LEAST * jnp.where(whole > 0, whole, 1))
 
@@ -370,7 +370,7 @@ def descend(function: Callable, first: Array, unravel: Callable, bound, prior: C
     Reference: O'Donoghue and Candes 2015, "Adaptive restart for accelerated gradient schemes".
     """
     count = len(jax.eval_shape(function, first))
-    bounded = any(np.isfinite(each).any() for each in bound)
+    bounded = any(np.isfinite(side).any() for side in bound)
 
     def extra(x):
         return jnp.zeros((), x.dtype) if prior is None else prior(unravel(x))
@@ -387,7 +387,7 @@ def descend(function: Callable, first: Array, unravel: Callable, bound, prior: C
         left, along = jax.linearize(function, x)
         back = jax.linear_transpose(along, x)
         square, size = _units(back, count, x.dtype)
-        limit = [tuple(each / size for each in bound)] if bounded else []
+        limit = [tuple(side / size for side in bound)] if bounded else []
 
         def curved(towards):
             bent = size * back(along(size * towards))[0]
@@ -403,7 +403,7 @@ def descend(function: Callable, first: Array, unravel: Callable, bound, prior: C
         moved, state = solver(*scales).update(y, state, *limit)
         return moved, state, both(function(scales[0] * moved), scales[0] * moved)
 
-    bound = tuple(jnp.asarray(each, first.dtype) for each in bound)
+    bound = tuple(jnp.asarray(side, first.dtype) for side in bound)
     square, scales, limit, y, start, (norm, now) = begin(first, bound)
     _finite(square, norm, now)
     state = start

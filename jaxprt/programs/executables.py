@@ -95,7 +95,7 @@ def described(value: Any) -> str:
     if kind in (tuple, list):
         return f"{kind.__name__}({','.join(map(described, value))})"
     if kind is dict:
-        return f"dict({','.join(f'{described(name)}:{described(each)}' for name, each in value.items())})"
+        return f"dict({','.join(f'{described(name)}:{described(item)}' for name, item in value.items())})"
     if isinstance(value, enum.Enum | np.dtype):
         return f"{_known(kind)}.{value.name}"
     if isinstance(value, type) or hasattr(value, "__qualname__"):
@@ -114,12 +114,12 @@ def described(value: Any) -> str:
 def _known(thing: Any) -> str:
     """Name of a class or function at the top level of a module whose code has a version."""
     module, name = thing.__module__, thing.__qualname__
-    found: Any = sys.modules.get(module)
+    target: Any = sys.modules.get(module)
     for part in name.split("."):
-        found = getattr(found, part, None)
-    while found is not thing and hasattr(found, "__wrapped__"):
-        found = found.__wrapped__
-    if found is not thing or module.split(".")[0] not in _KNOWN:
+        target = getattr(target, part, None)
+    while target is not thing and hasattr(target, "__wrapped__"):
+        target = target.__wrapped__
+    if target is not thing or module.split(".")[0] not in _KNOWN:
         raise UnnamedError(f"{module}.{name}")
     return f"{module}.{name}"
 
@@ -152,7 +152,7 @@ class Kept:
         leaf, tree = jax.tree.flatten(operand)
         if not (core.trace_state_clean() and _ordinary() and _concrete(leaf)):
             return self._compiled(*argument, **named)
-        aval = tuple((each.shape, each.dtype, getattr(each, "weak_type", False)) for each in leaf)
+        aval = tuple((value.shape, value.dtype, getattr(value, "weak_type", False)) for value in leaf)
         signature = tree, aval, tuple(sorted(option.items())), config.trace_context()
         try:
             executable = self._executables.get(signature)
@@ -201,13 +201,13 @@ class Kept:
 
 def count() -> int:
     """Number of executables that this process holds."""
-    return sum(len(each._executables) for each in _every)
+    return sum(len(program._executables) for program in _every)
 
 
 def forget() -> None:
     """Forgets the executables of this process, as `jax.clear_caches` forgets other programs."""
-    for each in _every:
-        each.forget()
+    for program in _every:
+        program.forget()
 
 
 def _concrete(leaves: Sequence[Any]) -> bool:

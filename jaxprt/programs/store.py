@@ -150,11 +150,11 @@ def _replace(path: pathlib.Path, content: bytes) -> None:
 def _made(folder: pathlib.Path) -> bool:
     """Creates the folder if it is absent, in a folder of the user, and says whether it can be trusted."""
     if not folder.exists():
-        parent = next(each for each in folder.parents if each.exists())
+        parent = next(parent for parent in folder.parents if parent.exists())
         if not folder.is_absolute() or not _owned(parent.stat()):  # for example the home of the user who called sudo
             return False
-        for each in (*reversed(folder.parents), folder):
-            each.mkdir(mode=0o700, exist_ok=True)
+        for directory in (*reversed(folder.parents), folder):
+            directory.mkdir(mode=0o700, exist_ok=True)
     return _trusted(folder)
 
 

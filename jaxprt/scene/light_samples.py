@@ -54,11 +54,11 @@ def importance(environments: Sequence[Environment], *, count: int) -> LightSampl
         require.kind(f"environment {number}", light, Environment, source="jaxprt.load_environment")
         require.array(f"the radiance of environment {number}", light.radiance, "6 n n c")
     colors = max(light.radiance.shape[-1] for light in environments)
-    each = [_sampled(np.asarray(light.radiance, np.float64), count) for light in environments]
-    weight = np.zeros((len(each), count, len(each), colors), np.float32)
-    for number, (_, own) in enumerate(each):
-        weight[number, :, number, : own.shape[-1]] = own
-    direction = np.concatenate([direction for direction, _ in each]).astype(np.float32)
+    samples = [_sampled(np.asarray(light.radiance, np.float64), count) for light in environments]
+    weight = np.zeros((len(samples), count, len(samples), colors), np.float32)
+    for number, (_, weights) in enumerate(samples):
+        weight[number, :, number, : weights.shape[-1]] = weights
+    direction = np.concatenate([direction for direction, _ in samples]).astype(np.float32)
     return LightSamples(direction, weight.reshape(-1, *weight.shape[2:]))
 
 
@@ -142,16 +142,16 @@ def places_in_texels(
     """
     factor = radiance.shape[1] // size
     face, row, column = texel // size**2, texel // size % size, texel % size
-    down, across = (factor * each[:, None] + np.arange(factor) for each in (row, column))
+    down, across = (factor * index[:, None] + np.arange(factor) for index in (row, column))
     fine = np.maximum(radiance[face[:, None, None], down[:, :, None], across[:, None]].astype(np.float64).sum(-1), 0)
     fine = np.where(fine.sum((1, 2), keepdims=True) > 0, fine, 1)
     share = fine / fine.sum((1, 2), keepdims=True)
     place = (2 * np.arange(factor) + 1) / factor - 1
-    own = 1 / (3 * factor**2)  # variance of a fine texel
+    texel_variance = 1 / (3 * factor**2)  # variance of a fine texel
     mean, spread = [], []
     for weight in (share.sum(1), share.sum(2)):
         mean.append(weight @ place)
-        spread.append(np.sqrt(3 * (weight @ place**2 - mean[-1] ** 2 + own)))
+        spread.append(np.sqrt(3 * (weight @ place**2 - mean[-1] ** 2 + texel_variance)))
     return np.stack([*mean, *spread], -1)
 
 
@@ -181,8 +181,8 @@ def in_texels(
     reached = (np.arange(count) + 0.5) / count * total[:, -1:]
     cell = np.stack([np.searchsorted(*pair) for pair in zip(total, reached, strict=True)])
     cell = np.minimum(cell, factor * factor - 1)
-    own = np.arange(len(texel))[:, None]
-    inside = _on_curve(np.clip(1 - (total[own, cell] - reached) / flux[own, cell], 0, 1).ravel()).reshape(
+    which = np.arange(len(texel))[:, None]
+    inside = _on_curve(np.clip(1 - (total[which, cell] - reached) / flux[which, cell], 0, 1).ravel()).reshape(
         2, *cell.shape
     )
     start = np.stack([factor * column[:, None] + across[cell], factor * row[:, None] + down[cell]])

@@ -234,7 +234,7 @@ class TexturedMaterial(eqx.Module):
     @property
     def textures(self) -> tuple[Texture, ...]:
         """All textures of the material."""
-        return tuple(each for each in vars(self).values() if isinstance(each, Texture))
+        return tuple(value for value in vars(self).values() if isinstance(value, Texture))
 
     @jit
     def at(
@@ -263,9 +263,9 @@ class TexturedMaterial(eqx.Module):
         places = (coordinate, coordinate if second is None else second)
         batch = coordinate.shape[:-1]
 
-        def value(factor: Array, each: Texture | None) -> Array:
+        def value(factor: Array, source: Texture | None) -> Array:
             wide = jnp.broadcast_to(factor, (*batch, *(factor.shape or (1,))))
-            return wide if each is None else wide * each.at(*places)
+            return wide if source is None else wide * source.at(*places)
 
         base = value(self.base_color, self.base_color_texture)
         anisotropy, direction = self._anisotropy(places)
@@ -309,9 +309,9 @@ class TexturedMaterial(eqx.Module):
         return jnp.roll(_unit(scaled), -1, -1)
 
 
-def _check_channels(name: str, each: Texture) -> None:
+def _check_channels(name: str, source: Texture) -> None:
     """Refuses a texture of another number of channels than it is read for. Colors may be gray."""
-    factor, channels = name.removesuffix("_texture"), jnp.shape(each.image)[-1]
+    factor, channels = name.removesuffix("_texture"), jnp.shape(source.image)[-1]
     allowed = (1, 3) if factor in _COLORS else (3,) if factor in ("normal", "anisotropy") else (1,)
     if channels not in allowed:
         required = " or ".join(map(str, allowed))
@@ -352,14 +352,14 @@ def opacity_of_parts(parts: Sequence[Any]) -> Opacity | None:
     layer, rows, texels, first = np.zeros(total, np.int32), [_OPAQUE], [np.ones(1, np.float32)], 0
     place: dict[Any, int] = {}
     for part, glass, through in zip(parts, glasses, clear, strict=True):
-        own = slice(first, first + len(part.mesh.position))
-        first = own.stop
+        span = slice(first, first + len(part.mesh.position))
+        first = span.stop
         if not through:
             continue
         material, wrap, start, shape = part.material, (0, 0), -1, (1, 1)
-        layer[own] = len(rows)
+        layer[span] = len(rows)
         source = material.alpha_texture if glass is None else material.transmission_texture
-        factor[own] = _factor(part) if glass is None else 1 - glass.luminance if source is None else 1
+        factor[span] = _factor(part) if glass is None else 1 - glass.luminance if source is None else 1
         if source is not None:
             key = id(source.image), glass and glass.luminance
             image = np.asarray(source.image, np.float32)[..., 0]
@@ -370,7 +370,7 @@ def opacity_of_parts(parts: Sequence[Any]) -> Opacity | None:
             wrap = tuple(texture.WRAPS.index(mode) for mode in source.wrap)
             sets = part.mesh.texture, part.mesh.texture if part.second is None else part.second
             move = np.asarray(source.transform, np.float64)
-            coordinate[own] = np.asarray(sets[source.set], np.float64) @ move[:, :2].T + move[:, 2]
+            coordinate[span] = np.asarray(sets[source.set], np.float64) @ move[:, :2].T + move[:, 2]
         cutoff = BLEND if glass is not None or material.alpha_mode == "blend" else float(material.alpha_cutoff)
         rows.append((cutoff, wrap, start, shape, (1, 1, 1) if glass is None else tuple(glass.color), glass is not None))
     cutoff, wrap, start, shape, passing, clean = (np.array(column) for column in zip(*rows, strict=True))

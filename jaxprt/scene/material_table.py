@@ -184,10 +184,10 @@ class MaterialTable(eqx.Module):
         count = len(points)
         if count == ROW or not count or not known(points) or points.corner.shape[0] != 3:
             return _looked(self, points)
-        own = np.minimum(np.arange(-(-count // ROW) * ROW), count - 1).reshape(-1, ROW)
+        index = np.minimum(np.arange(-(-count // ROW) * ROW), count - 1).reshape(-1, ROW)
         host = jax.tree.map(np.asarray, points)
         slope = np.zeros((2, *host.weight.shape), host.weight.dtype) if host.slope is None else host.slope
-        rows = [_looked(self, put(Points(host.corner[:, n], host.weight[:, n], slope[..., n]))) for n in own]
+        rows = [_looked(self, put(Points(host.corner[:, n], host.weight[:, n], slope[..., n]))) for n in index]
         xp = np if known(rows) else jnp
         return jax.tree.map(lambda *row: xp.concatenate(row)[:count], *rows)
 
@@ -251,23 +251,23 @@ def _values(table: MaterialTable, points: Points) -> tuple[Values, Layers | None
     layers = None
     if table.layered:
         scale = jax.lax.map(read, len(TEXTURES) + jnp.arange(len(_LAYERS)))
-        begin, each = _SHINY + 1, []
+        begin, columns = _SHINY + 1, []
         for texel, (_, width) in zip(scale, _LAYERS, strict=True):
             value = factor[:, begin : begin + width] * texel[:, :width]
-            each.append(value if width > 1 else value[:, 0])
+            columns.append(value if width > 1 else value[:, 0])
             begin += width
-        layers = Layers(*each)
+        layers = Layers(*columns)
     color = points.carry(table.color)
     first = np.cumsum([0, *(width for _, width in _FACTORS)])
-    each = {name: factor[:, begin : begin + width] for (name, width), begin in zip(_FACTORS, first, strict=False)}
+    factors = {name: factor[:, begin : begin + width] for (name, width), begin in zip(_FACTORS, first, strict=False)}
     values = Values(
-        each["base_color"] * base * color,
-        each["metallic"][:, 0] * metallic[:, 0],
-        each["roughness"][:, 0] * roughness[:, 0],
-        each["emissive"] * emissive,
-        each["specular"][:, 0] * specular[:, 0],
-        each["specular_color"] * tint,
-        each["ior"][:, 0],
+        factors["base_color"] * base * color,
+        factors["metallic"][:, 0] * metallic[:, 0],
+        factors["roughness"][:, 0] * roughness[:, 0],
+        factors["emissive"] * emissive,
+        factors["specular"][:, 0] * specular[:, 0],
+        factors["specular_color"] * tint,
+        factors["ior"][:, 0],
     )
     return values, layers
 
@@ -303,8 +303,8 @@ def _in_image(
     """Coordinates of points in the image of a texture, and their change from pixel to pixel."""
     second = table.set[part, texture][:, None] > 0
     turn = table.transform[part, texture]
-    own, change = (jnp.where(second, each[..., 2:], each[..., :2]) for each in place)
-    moved = jnp.einsum("pij,pj->pi", turn[..., :2], own, precision="highest") + turn[..., 2]
+    coordinate, change = (jnp.where(second, value[..., 2:], value[..., :2]) for value in place)
+    moved = jnp.einsum("pij,pj->pi", turn[..., :2], coordinate, precision="highest") + turn[..., 2]
     return moved, jnp.einsum("pij,kpj->kpi", turn[..., :2], change, precision="highest")
 
 
@@ -322,12 +322,12 @@ def _read(
     part = table.part[points.corner[0]]
     image = table.image[part, texture]
 
-    def found() -> Array:
+    def image_values() -> Array:
         moved, moving = _in_image(table, part, place, texture)
         value = _looked_up(table.texels, jnp.maximum(image, 0), moved, moving, table.wrap[part, texture])
         return jnp.where(image[:, None] >= 0, value, 1)
 
-    return jax.lax.cond(jnp.any(image >= 0), found, lambda: jnp.ones((len(points), 3), table.texels.value.dtype))
+    return jax.lax.cond(jnp.any(image >= 0), image_values, lambda: jnp.ones((len(points), 3), table.texels.value.dtype))
 
 
 def _looked_up(
@@ -416,23 +416,23 @@ def of_parts(parts: Sequence[Part]) -> MaterialTable:
     count = [len(part.mesh.position) for part in parts]
     dtype, room = jnp.result_type(float), shared_size(sum(count)) - sum(count)
 
-    def column(each: Sequence[Any], otherwise: float, width: int) -> Any:
-        pairs = zip(count, each, strict=True)
-        rows = [np.full((n, width), otherwise, dtype) if own is None else own for n, own in pairs]
+    def column(values: Sequence[Any], otherwise: float, width: int) -> Any:
+        pairs = zip(count, values, strict=True)
+        rows = [np.full((n, width), otherwise, dtype) if value is None else value for n, value in pairs]
         return _concatenated([*rows, np.full((room, width), otherwise, dtype)], dtype)
 
     first = column([part.mesh.texture for part in parts], 0.0, 2)
     second = column([part.mesh.texture if part.second is None else part.second for part in parts], 0.0, 2)
     both = jnp.concatenate([first, second], 1) if not known(first, second) else np.concatenate([first, second], 1)
     part = np.repeat(np.arange(len(parts), dtype=np.int32), count)
-    columns = np.pad(part, (0, room)), both, column([each.color for each in parts], 1.0, 3)
+    columns = np.pad(part, (0, room)), both, column([item.color for item in parts], 1.0, 3)
     held: dict[str, Any] = dict(zip(("part", "coordinate", "color"), columns, strict=True))
     layered = any(has_layers(material) for material in materials)
     if any(_has_map(material) for material in materials):
         hand = column(
-            [each.handedness if each.handedness is None else each.handedness[:, None] for each in parts], 1.0, 1
+            [item.handedness if item.handedness is None else item.handedness[:, None] for item in parts], 1.0, 1
         )
-        rows = [column([getattr(each.mesh, name) for each in parts], 1.0, 3) for name in ("normal", "tangent")]
+        rows = [column([getattr(item.mesh, name) for item in parts], 1.0, 3) for name in ("normal", "tangent")]
         held["frame"] = (np if known(rows, hand) else jnp).concatenate([*rows, hand], 1)
     return MaterialTable(**_rows(materials, dtype, layered=layered, tilted="frame" in held), **held)
 
@@ -476,7 +476,7 @@ def has_layers(material: Any) -> bool:
     """Whether a material has a clear coat or a sheen or lets light pass. Values that JAX traces may be anything."""
     if not isinstance(material, TexturedMaterial):
         return False
-    return any(may_be(each) for each in (material.clearcoat, material.transmission, material.sheen_color))
+    return any(may_be(factor) for factor in (material.clearcoat, material.transmission, material.sheen_color))
 
 
 def may_be(value: Any) -> bool:
@@ -484,16 +484,16 @@ def may_be(value: Any) -> bool:
     return isinstance(value, Tracer) or bool(np.any(np.asarray(value) != 0))
 
 
-def _key(name: str, each: Texture) -> tuple[int, bool]:
+def _key(name: str, source: Texture) -> tuple[int, bool]:
     """Key of the image of a texture of some name. An image that is a normal map and another texture has two."""
-    return id(each.image), name == TEXTURES[_NORMAL]
+    return id(source.image), name == TEXTURES[_NORMAL]
 
 
 def _images(materials: Sequence[TexturedMaterial | Callable]) -> dict[tuple[int, bool], Any]:
     """The images of the textures of some materials, each once."""
     names = (*TEXTURES, *LAYER_TEXTURES)
     pairs = [(name, getattr(material, name, None)) for material in materials for name in names]
-    return {_key(name, each): each.image for name, each in pairs if each is not None}
+    return {_key(name, source): source.image for name, source in pairs if source is not None}
 
 
 def _rows(
@@ -515,25 +515,25 @@ def _rows(
     else:
         images = old
     names = (*TEXTURES, *LAYER_TEXTURES) if layered else TEXTURES
-    number, image = {each: n for n, each in enumerate(images)}, np.full((rows, len(names)), -1, np.int32)
+    number, image = {key: n for n, key in enumerate(images)}, np.full((rows, len(names)), -1, np.int32)
     transform: Any = np.zeros((*image.shape, 2, 3), dtype)
     sets, wrap = np.zeros(image.shape, np.int32), np.zeros((*image.shape, 2), np.int32)
     for row, material in enumerate(materials):
         for column, name in enumerate(names):
-            own: Texture | None = getattr(material, name, None)
-            if own is None:
+            source: Texture | None = getattr(material, name, None)
+            if source is None:
                 continue
-            image[row, column] = number[_key(name, own)]
-            sets[row, column] = own.set
-            wrap[row, column] = [texture.WRAPS.index(mode) for mode in own.wrap]
-            transform = _placed(transform, (row, column), own.transform)
+            image[row, column] = number[_key(name, source)]
+            sets[row, column] = source.set
+            wrap[row, column] = [texture.WRAPS.index(mode) for mode in source.wrap]
+            transform = _placed(transform, (row, column), source.transform)
     factor = _concatenated([_factors(material, layered)[None] for material in materials], dtype)
     padding = np.zeros((rows - len(materials), factor.shape[1]), dtype)
-    made = {"image": image, "transform": transform, "set": sets, "wrap": wrap, "texels": texels}
+    columns = {"image": image, "transform": transform, "set": sets, "wrap": wrap, "texels": texels}
     if tilted:
         scale = [np.reshape(getattr(material, "normal_scale", 1.0), 1) for material in materials]
-        made["normal_scale"] = _concatenated([*scale, np.ones(rows - len(materials))], dtype)
-    return {"factor": _concatenated([factor, padding], dtype), **made}
+        columns["normal_scale"] = _concatenated([*scale, np.ones(rows - len(materials))], dtype)
+    return {"factor": _concatenated([factor, padding], dtype), **columns}
 
 
 def _placed(array: Any, place: tuple[int, int], value: Any) -> Any:
@@ -570,10 +570,10 @@ def _texels(images: Mapping[tuple[int, bool], Any], dtype: Any, least: Texels | 
     start[:, 0], values, total = 0, [], 0
     for row, ((_, normals), image) in enumerate(images.items()):
         image = texture.unit_normals(image) if normals else image
-        for level, own in enumerate(texture.mipmap(image)):
+        for level, pixels in enumerate(texture.mipmap(image)):
             start[row, level] = total
-            total += own.size
-            values.append(own.reshape(-1))
+            total += pixels.size
+            values.append(pixels.reshape(-1))
         shape[row], channels[row] = image.shape[:2], image.shape[2]
     if total >= 1 << 31:
         raise ValueError(f"textures must have fewer than 2^31 values with their mip maps, got {total}")

@@ -317,8 +317,8 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     face, region = (jax.device_put(np.concatenate(field).astype(np.int32)) for field in (face, region))
     texture = None
     if any(mesh.texture is not None for mesh in meshes):
-        each = [np.zeros((len(mesh.position), 2)) if mesh.texture is None else mesh.texture for mesh in meshes]
-        texture = jax.device_put(np.concatenate(each).astype(position.dtype))
+        coordinates = [np.zeros((len(mesh.position), 2)) if mesh.texture is None else mesh.texture for mesh in meshes]
+        texture = jax.device_put(np.concatenate(coordinates).astype(position.dtype))
     return Mesh(position, face, normal, tangent, region, texture, meshes[0].origin)
 
 
@@ -385,8 +385,8 @@ def rotate(mesh: Mesh, rotation: ArrayLike) -> Mesh:
     """
     matrix = np.asarray(rotation, np.float64)
     place, normal, tangent = (
-        jnp.matmul(each, jnp.asarray(matrix.T, each.dtype), precision="highest")
-        for each in (mesh.position, mesh.normal, mesh.tangent)
+        jnp.matmul(vector, jnp.asarray(matrix.T, vector.dtype), precision="highest")
+        for vector in (mesh.position, mesh.normal, mesh.tangent)
     )
     x, y, z = (matrix @ np.asarray(mesh.origin)).tolist()
     return Mesh(place, mesh.face, normal, tangent, mesh.region, mesh.texture, (x, y, z), mesh.opacity)
@@ -414,8 +414,8 @@ def brush(mesh: Mesh, direction: ArrayLike) -> Mesh:
     elif along.shape != (3,) or not np.all(np.isfinite(along)) or not np.any(along):
         raise ValueError(f"direction must be three finite numbers that are not all zero, got {along.tolist()}")
     scaled = along / np.maximum(np.abs(along).max(-1, keepdims=True), np.finfo(np.float64).tiny)
-    every = jnp.broadcast_to(jnp.asarray(scaled, mesh.normal.dtype), mesh.normal.shape)
-    return eqx.tree_at(lambda each: each.tangent, mesh, directions.frame(mesh.normal, every)[:, 0])
+    tangent = jnp.broadcast_to(jnp.asarray(scaled, mesh.normal.dtype), mesh.normal.shape)
+    return eqx.tree_at(lambda m: m.tangent, mesh, directions.frame(mesh.normal, tangent)[:, 0])
 
 
 @require.arguments(mesh=check_mesh, vertices=partial(require.count, "vertices", least=-1, most=1 << 26))
@@ -561,9 +561,10 @@ def frames(normal: ArrayLike, tangent: ArrayLike) -> Float[np.ndarray, "v 3 3"]:
     if not count:
         return np.zeros((0, 3, 3), normal.dtype)
     rows = (
-        np.pad(each, ((0, -count % _BLOCK), (0, 0)), mode="edge").reshape(-1, _BLOCK, 3) for each in (normal, tangent)
+        np.pad(vector, ((0, -count % _BLOCK), (0, 0)), mode="edge").reshape(-1, _BLOCK, 3)
+        for vector in (normal, tangent)
     )
-    return np.concatenate([np.asarray(directions.frame(*each)) for each in zip(*rows, strict=True)])[:count]
+    return np.concatenate([np.asarray(directions.frame(*row)) for row in zip(*rows, strict=True)])[:count]
 
 
 def areas(mesh: Mesh) -> Float[np.ndarray, " v"]:

@@ -46,7 +46,7 @@ class Points(eqx.Module):
     def slopes(self, attribute: Float[Array | np.ndarray, "v c"]) -> Float[Array, "2 p c"]:
         """Change of a vertex attribute from one pixel to the next, to the right and down."""
         assert self.slope is not None
-        return jnp.stack([Points(self.corner, each).carry(attribute) for each in self.slope])
+        return jnp.stack([Points(self.corner, slope).carry(attribute) for slope in self.slope])
 
     def tilted(self, normal: Float[Array | np.ndarray, "p 3"] | None) -> "Points":
         """The same points with other shading normals; with the interpolated ones if `normal` is None."""
@@ -123,8 +123,8 @@ def on_triangles(
     if np.shape(barycentric) != (*np.shape(triangle), 3) or np.ndim(triangle) != 1:
         shapes = f"{list(np.shape(triangle))} and {list(np.shape(barycentric))}"
         raise ValueError(f"points must be triangles [p] and weights [p, 3], got {shapes}")
-    if not any(isinstance(each, Tracer) for each in (face, triangle, barycentric)):
-        face, triangle, barycentric = (np.asarray(each) for each in (face, triangle, barycentric))
+    if not any(isinstance(value, Tracer) for value in (face, triangle, barycentric)):
+        face, triangle, barycentric = (np.asarray(value) for value in (face, triangle, barycentric))
         if triangle.size and (triangle.min() < 0 or triangle.max() >= len(face)):
             raise ValueError(f"triangles must be from 0 to {len(face) - 1}, got {triangle.min()} to {triangle.max()}")
         off = np.maximum(-barycentric.min(1, initial=0), np.abs(barycentric.sum(1) - 1))

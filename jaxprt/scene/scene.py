@@ -86,9 +86,9 @@ class Part(eqx.Module):
                 got = type(self.material).__name__
                 raise TypeError(f"the material of part {self.name!r} must be a TexturedMaterial or a BRDF, got {got}")
             return
-        for each in self.material.textures:
-            if (self.mesh.texture, self.second)[each.set] is None:
-                field = ("mesh.texture", "second")[each.set]
+        for texture in self.material.textures:
+            if (self.mesh.texture, self.second)[texture.set] is None:
+                field = ("mesh.texture", "second")[texture.set]
                 raise ValueError(f"part {self.name!r} must have {field} for the textures of its material, got None")
 
     def surface(self) -> Surface:
@@ -196,7 +196,7 @@ def _aligned(parts: Any) -> tuple:
         return parts
     moved = meshes.aligned([part.mesh for part in parts])
     return tuple(
-        part if mesh is part.mesh else eqx.tree_at(lambda each: each.mesh, part, mesh)
+        part if mesh is part.mesh else eqx.tree_at(lambda p: p.mesh, part, mesh)
         for part, mesh in zip(parts, moved, strict=True)
     )
 
@@ -234,11 +234,11 @@ class Scene(eqx.Module):
             ("point_lights", PointLight, "scene.PointLight"),
             ("suns", Sun, "scene.Sun"),
         ):
-            for each in getattr(self, name):
-                require.kind(f"each of the scene's {name}", each, kind, source=source)
+            for item in getattr(self, name):
+                require.kind(f"each of the scene's {name}", item, kind, source=source)
         if not self.parts:
             raise ValueError("a scene must have at least one part, got none")
-        count = collections.Counter(each.name for each in (*self.parts, *self.point_lights))
+        count = collections.Counter(item.name for item in (*self.parts, *self.point_lights))
         twice = sorted(name for name, times in count.items() if times > 1)
         if twice:
             raise ValueError(f"the parts of a scene must have different names, got several named {twice}")
@@ -263,7 +263,7 @@ class Scene(eqx.Module):
         """
         whole = meshes.join(
             [
-                eqx.tree_at(lambda each: each.region, part.mesh, np.zeros(len(part.mesh.position), np.int32))
+                eqx.tree_at(lambda m: m.region, part.mesh, np.zeros(len(part.mesh.position), np.int32))
                 for part in self.parts
             ]
         )
@@ -276,10 +276,10 @@ def centered(scene: Scene) -> Scene:
     origin = scene.parts[0].mesh.origin
     if origin == origins.ZERO:
         return scene
-    parts = [eqx.tree_at(lambda each: each.mesh, part, meshes.centered(part.mesh)) for part in scene.parts]
+    parts = [eqx.tree_at(lambda p: p.mesh, part, meshes.centered(part.mesh)) for part in scene.parts]
     lamps = [
         eqx.tree_at(
-            lambda each: each.position, lamp, origins.local(f"point light {lamp.name!r}", lamp.position, origin)
+            lambda light: light.position, lamp, origins.local(f"point light {lamp.name!r}", lamp.position, origin)
         )
         for lamp in scene.point_lights
     ]

@@ -46,7 +46,7 @@ def with_copies(scene: Scene) -> tuple[Scene, tuple[Int[np.ndarray, " _"], ...]]
     if not any(lit):
         return scene, (none,) * len(lit)
     rows = zip(scene.parts, _seen_backs(centered(scene)), lit, strict=True)
-    parts, copied = zip(*(_doubled(part, own) if wanted else (part, none) for part, own, wanted in rows), strict=True)
+    parts, copied = zip(*(_doubled(part, face) if wanted else (part, none) for part, face, wanted in rows), strict=True)
     return dataclasses.replace(scene, parts=list(parts)), copied
 
 
@@ -115,7 +115,7 @@ def _windings(
     Reference: Van Oosterom and Strackee 1983, "The solid angle of a plane triangle".
     """
     a, b, c = np.moveaxis(corner - point, 1, 0)
-    la, lb, lc = (np.linalg.norm(each, axis=1) for each in (a, b, c))
+    la, lb, lc = (np.linalg.norm(edge, axis=1) for edge in (a, b, c))
     below = la * lb * lc + np.sum(a * b, 1) * lc + np.sum(b * c, 1) * la + np.sum(c * a, 1) * lb
     angle = 2 * np.arctan2(np.sum(a * np.cross(b, c), 1), below)
     return np.bincount(piece, angle) / (4 * np.pi)

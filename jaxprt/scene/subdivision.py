@@ -126,13 +126,13 @@ class Edges:
         middle = np.full(cut.shape, -1)
         middle[cut] = self._vertices + index
         turn = (self._turn[:, None] + np.arange(3)) % 3
-        corner, middle = (np.take_along_axis(each, turn, 1) for each in (self.face, middle))
-        every = np.concatenate([corner, middle], 1)
+        corner, middle = (np.take_along_axis(corners, turn, 1) for corners in (self.face, middle))
+        node = np.concatenate([corner, middle], 1)
         face, origin = [], []
         for which, children in _CHILDREN.items():
-            own = np.flatnonzero(((middle >= 0) == which).all(1))
-            face.append(every[own][:, children].reshape(-1, 3))
-            origin.append(np.repeat(own, len(children)))
+            rows = np.flatnonzero(((middle >= 0) == which).all(1))
+            face.append(node[rows][:, children].reshape(-1, 3))
+            origin.append(np.repeat(rows, len(children)))
         order = np.argsort(np.concatenate(origin), kind="stable")
         ends = np.stack(np.divmod(parent, self._vertices), -1)
         return Division(np.concatenate(face)[order], np.concatenate(origin)[order], ends)
@@ -196,7 +196,7 @@ def subdivide(mesh: Mesh, divisions: Sequence[Division]) -> Mesh:
     interpolated in the same way as for shading and normalized; tangents are made orthogonal to them. An added vertex
     gets the region of the first of the two vertices between which it lies. Existing vertices do not change.
     """
-    return _subdivided(mesh, [each.parent for each in divisions], divisions[-1].face) if divisions else mesh
+    return _subdivided(mesh, [division.parent for division in divisions], divisions[-1].face) if divisions else mesh
 
 
 def subdivide_scene(scene: Scene, divisions: Sequence[Division]) -> Scene:
@@ -220,7 +220,7 @@ def subdivide_scene(scene: Scene, divisions: Sequence[Division]) -> Scene:
     parents, owner, number = _of_parts(counts, [division.parent for division in divisions])
     face = divisions[-1].face
     faces = [number[face[owner[face[:, 0]] == part]] for part in range(len(counts))]
-    parts = [_subdivided_part(*each) for each in zip(scene.parts, parents, faces, strict=True)]
+    parts = [_subdivided_part(*row) for row in zip(scene.parts, parents, faces, strict=True)]
     return dataclasses.replace(scene, parts=parts)
 
 
@@ -244,9 +244,9 @@ def _of_parts(
     for parent in parents:
         of_added, place = owner[parent[:, 0]], np.empty(len(parent), np.int64)
         for part, all_parents in enumerate(result):
-            own = np.flatnonzero(of_added == part)
-            place[own] = np.count_nonzero(owner == part) + np.arange(len(own))
-            all_parents.append(number[parent[own]])
+            rows = np.flatnonzero(of_added == part)
+            place[rows] = np.count_nonzero(owner == part) + np.arange(len(rows))
+            all_parents.append(number[parent[rows]])
         owner, number = np.concatenate([owner, of_added]), np.concatenate([number, place])
     return result, owner, number
 
@@ -288,8 +288,8 @@ def divide(scene: Scene, *, edge: float) -> Scene:
 def _subdivided(mesh: Mesh, parents: Sequence[np.ndarray], face: np.ndarray) -> Mesh:
     """The mesh with added vertices, each between two earlier ones."""
     triangle = jax.device_put(face.astype(np.asarray(mesh.face).dtype))
-    if not any(len(each) for each in parents):
-        return eqx.tree_at(lambda each: each.face, mesh, triangle)
+    if not any(len(parent) for parent in parents):
+        return eqx.tree_at(lambda m: m.face, mesh, triangle)
     count = len(mesh.position)
     position, tangent = spread(mesh.position, parents), spread(np.asarray(mesh.tangent, np.float64), parents)
     normal = np.asarray(mesh.normal, np.float64)
@@ -310,8 +310,8 @@ def _subdivided(mesh: Mesh, parents: Sequence[np.ndarray], face: np.ndarray) -> 
 def _subdivided_part(part: Part, parents: Sequence[np.ndarray], face: np.ndarray) -> Part:
     """The part with added vertices, each between two earlier ones."""
     color, second, alpha = (
-        None if each is None else jax.device_put(spread(each, parents))
-        for each in (part.color, part.second, part.alpha)
+        None if attribute is None else jax.device_put(spread(attribute, parents))
+        for attribute in (part.color, part.second, part.alpha)
     )
     handedness = None if part.handedness is None else jax.device_put(_first(part.handedness, parents))
     return Part(part.name, _subdivided(part.mesh, parents, face), part.material, color, second, handedness, alpha)

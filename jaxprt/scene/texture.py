@@ -53,7 +53,7 @@ def _halved(image: Any, axis: int) -> Any:
         texel = np.minimum(first + tap, size - 1)
         covered = np.minimum(first + tap + 1, edge[1:]) - np.maximum(first + tap, edge[:-1])
         weight = np.maximum(covered, 0) / step
-        wide = [-1 if each == axis else 1 for each in range(image.ndim)]
+        wide = [-1 if number == axis else 1 for number in range(image.ndim)]
         total = total + image.take(texel, axis) * weight.reshape(wide).astype(image.dtype)
     return total
 
@@ -150,7 +150,7 @@ def dpdu(mesh: Mesh) -> Float[np.ndarray, "v 3"]:
     if mesh.texture is None:
         raise ValueError("the mesh must have texture coordinates, got none: give them to `jaxprt.scene.mesh.make_mesh`")
     face = np.asarray(mesh.face)
-    corner, place = (np.asarray(each, np.float64)[face] for each in (mesh.position, mesh.texture))
+    corner, place = (np.asarray(value, np.float64)[face] for value in (mesh.position, mesh.texture))
     edge, step = corner[:, 1:] - corner[:, :1], place[:, 1:] - place[:, :1]
     covered = np.linalg.det(step)
     # Differences within the rounding of float32 coordinates are not meaningful.

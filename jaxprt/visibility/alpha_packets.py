@@ -59,7 +59,7 @@ class AlphaPackets:
         opaque, clear = np.flatnonzero((layer == 0) & (not clear_only)), np.flatnonzero(layer > 0)
         if not clear_only:
             clear = clear[~_is_reverse(position, face[clear])]
-        self._scene, self._index = packets.new_scene(self), [own for own in (opaque, clear) if len(own)]
+        self._scene, self._index = packets.new_scene(self), [faces for faces in (opaque, clear) if len(faces)]
         if len(opaque):
             packets.attach(self._scene, position, face[opaque])
         self._table, self._kept = _table(face[clear], layer[clear], opacity)
@@ -104,10 +104,10 @@ class AlphaPackets:
         face, part = np.full(count, -1, np.int64), np.zeros(count, np.int32)
         distance, weight = np.empty(count, np.float32), np.zeros((count, 3), np.float32)
         _first(self._intersect, self._scene, origin, direction, face, part, distance, weight)
-        met = face >= 0
+        hit = face >= 0
         for number, index in enumerate(self._index):
-            own = met & (part == number)
-            face[own] = index[face[own]]
+            of_part = hit & (part == number)
+            face[of_part] = index[face[of_part]]
         return face, distance, weight
 
     def layers(

@@ -139,14 +139,14 @@ def compute(
         raise ValueError(f"part {part.number}/{part.count} must have a path, the folder that all parts share, got None")
     store = None if path is None else BlockStore(path, job.header, job.layout, blocks, job.near)
     counts = {name: _entries(at, job, blocks) for name, at in job.layout.items()}
-    own = range(blocks) if part is None else part.of(blocks)
-    total = sum(_count(job, block) for block in own)
+    chosen = range(blocks) if part is None else part.of(blocks)
+    total = sum(_count(job, block) for block in chosen)
     with tqdm.tqdm(total=total, desc=label, unit="vertex", unit_scale=True, disable=not progress) as bar:
         if store is None:
-            kept = _Kept(job, counts)
-            _run(job, own, kept.place, None, executor, bar)
-            return kept.array
-        todo = _missing(store, own)
+            memory = _Kept(job, counts)
+            _run(job, chosen, memory.place, None, executor, bar)
+            return memory.array
+        todo = _missing(store, chosen)
         bar.update(total - sum(_count(job, block) for block in todo))
         if todo:
             with store.writing((1, 1) if part is None else (part.number, part.count)):
@@ -154,7 +154,7 @@ def compute(
                 _run(job, _missing(store, todo), store.write, store, executor, bar)
         bar.update(bar.total - bar.n)
     if part is not None:
-        left = int(np.sum(~store.written())) or len(_missing(store, set(range(blocks)) - set(own)))
+        left = int(np.sum(~store.written())) or len(_missing(store, set(range(blocks)) - set(chosen)))
         if left:
             raise UnfinishedError(
                 f"part {part.number}/{part.count} of {store.path} is done; {left} of its {blocks} blocks are missing: "
@@ -204,9 +204,9 @@ class _Kept:
 def fingerprint(*array: Any) -> str:
     """SHA-256 of the shapes, types and bytes of some arrays."""
     digest = hashlib.sha256()
-    for each in array:
-        each = np.ascontiguousarray(np.asarray(each))
-        digest.update(f"{each.shape}{each.dtype}".encode() + each.tobytes())
+    for value in array:
+        value = np.ascontiguousarray(np.asarray(value))
+        digest.update(f"{value.shape}{value.dtype}".encode() + value.tobytes())
     return digest.hexdigest()
 
 
@@ -215,17 +215,17 @@ def scene_key(mesh: Mesh) -> str:
 
     Tangents do not count, and neither do the element types of the arrays. The opacity counts where there is one.
     """
-    single = [np.asarray(each, np.float32) for each in (mesh.position, mesh.normal)]
-    whole = [np.asarray(each, np.int32) for each in (mesh.face, mesh.region)]
+    single = [np.asarray(vector, np.float32) for vector in (mesh.position, mesh.normal)]
+    whole = [np.asarray(index, np.int32) for index in (mesh.face, mesh.region)]
     return fingerprint(*single, *whole, *jax.tree.leaves(mesh.opacity))
 
 
 def _run(job, todo, keep, store, executor, bar) -> None:
     """Computes blocks and passes each to `keep`, unless the worker has already written it to the store."""
     key = uuid.uuid4().hex
-    own = ThreadPoolExecutor(cores()) if executor is None else None
-    pool: Executor = executor or own  # pyright: ignore[reportAssignmentType]
-    here = own is not None or isinstance(executor, Part)
+    threads = ThreadPoolExecutor(cores()) if executor is None else None
+    pool: Executor = executor or threads  # pyright: ignore[reportAssignmentType]
+    here = threads is not None or isinstance(executor, Part)
     _jobs[key] = job, store
     # Every core already computes a block, and the additional threads of LAPACK would wait by spinning: beside two
     # busy processes clusters took three times as long. An executor that the caller passes has its own setting.
@@ -247,14 +247,14 @@ def _run(job, todo, keep, store, executor, bar) -> None:
                 speed = rays / max(bar.format_dict["elapsed"], 1e-9)
                 bar.set_postfix_str(f"{speed / 1e6:.1f} Mrays/s", refresh=False)
     except (BrokenExecutor, CancelledError) as error:
-        kept = "they are lost" if store is None else f"they are kept in {store.path}: call again to go on"
-        raise RuntimeError(f"a worker died after {bar.n} of {job.vertices} vertices; {kept}") from error
+        outcome = "they are lost" if store is None else f"they are kept in {store.path}: call again to go on"
+        raise RuntimeError(f"a worker died after {bar.n} of {job.vertices} vertices; {outcome}") from error
     finally:
         flow.cancel()
         _jobs.pop(key, None)
         try:
-            if own is not None:
-                own.shutdown(wait=True, cancel_futures=True)
+            if threads is not None:
+                threads.shutdown(wait=True, cancel_futures=True)
         finally:
             if limit is not None:
                 limit.restore_original_limits()
@@ -291,8 +291,8 @@ class _Flow:
 
     def cancel(self) -> None:
         """Cancels the blocks that have not started."""
-        for each in self._flying.values():
-            each.cancel()
+        for future in self._flying.values():
+            future.cancel()
 
     def _submit(self, block: int) -> None:
         sent = None
@@ -343,7 +343,7 @@ def _missing(store: BlockStore, blocks: Iterable[int]) -> list[int]:
     with ThreadPoolExecutor(cores()) as pool:
         blocks = list(blocks)
         there = pool.map(lambda block: written[block] and store.read(block) is not None, blocks)
-        return [block for block, found in zip(blocks, there, strict=True) if not found]
+        return [block for block, written in zip(blocks, there, strict=True) if not written]
 
 
 def _entries(at: Layout, job: Job, blocks: int) -> int:

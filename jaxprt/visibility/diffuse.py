@@ -44,10 +44,12 @@ class DiffuseTracer:
         corner = np.concatenate([mesh.face, occluder.face + len(mesh.position)])
         place = subdivision.places(np.concatenate([mesh.position, occluder.position]))
         _, alike = np.unique(np.sort(place[corner], 1), axis=0, return_inverse=True)
-        own, other = np.split(alike.ravel(), [count])
-        self.casts = np.isin(own, other)
-        self.double = np.maximum(*(np.bincount(each, minlength=len(corner))[own] for each in (own, other))) > 1
-        self._other = _mesh(np.asarray(occluder.position), np.asarray(occluder.face)[~np.isin(other, own)])
+        of_mesh, other = np.split(alike.ravel(), [count])
+        self.casts = np.isin(of_mesh, other)
+        self.double = (
+            np.maximum(*(np.bincount(identity, minlength=len(corner))[of_mesh] for identity in (of_mesh, other))) > 1
+        )
+        self._other = _mesh(np.asarray(occluder.position), np.asarray(occluder.face)[~np.isin(other, of_mesh)])
 
     def at_vertices(self, vertex: Int[np.ndarray, " n"] | None = None) -> Float32[np.ndarray, "v l c"]:
         """Reflected radiance at some or all vertices of the surface, before subdivision; 0 at others."""
@@ -85,11 +87,11 @@ class DiffuseTracer:
         mesh = _mesh(position[used], index[: around.size].reshape(-1, 3), normal[used])
         other = self._other
         place, face = (
-            np.concatenate(each) for each in ((other.position, position), (other.face, casting + len(other.position)))
+            np.concatenate(pair) for pair in ((other.position, position), (other.face, casting + len(other.position)))
         )
         start, buried = starts_and_buried(mesh, Occluder(_mesh(place, face)), offset=offset)
-        own = index[around.size :]
-        return self._light(start[own], normal[vertex]), buried[own]
+        rows = index[around.size :]
+        return self._light(start[rows], normal[vertex]), buried[rows]
 
     def at_points(
         self, start: Float[np.ndarray, "p 3"], normal: Float[np.ndarray, "p 3"], out: Float[np.ndarray, "p 3"]
@@ -127,6 +129,6 @@ def _mesh(position: np.ndarray, face: np.ndarray, normal: np.ndarray | None = No
     """A mesh in NumPy arrays, so that new shapes do not cause compilation. Fields that rays do not need are zero."""
     upright = np.zeros_like(position) if normal is None else normal
     fields = position.astype(np.float32), face.astype(np.int32), upright.astype(np.float32)
-    place, corner, upright = (jax.device_put(each) for each in fields)
+    place, corner, upright = (jax.device_put(value) for value in fields)
     region = jax.device_put(np.zeros(len(position), np.int32))
     return jax.tree.map(np.asarray, Mesh(place, corner, upright, upright, region))

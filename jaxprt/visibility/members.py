@@ -21,8 +21,8 @@ def coordinates(
 ) -> Float[np.ndarray, "v 6"]:
     """Positions and normals of vertices as one array, each centered and scaled to a mean square of one."""
     coordinate = []
-    for each in (np.asarray(position, np.float64), np.asarray(normal, np.float64)):
-        offset = each - each.mean(0)
+    for feature in (np.asarray(position, np.float64), np.asarray(normal, np.float64)):
+        offset = feature - feature.mean(0)
         coordinate.append(offset / (np.sqrt(np.mean(offset**2)) or 1.0))
     return np.concatenate(coordinate, 1)
 

@@ -105,9 +105,9 @@ class Occluder:
         inverse = inverse.reshape(-1)
         example[odd.astype(int), inverse] = np.arange(len(self.face))
         other = example[1 - odd.astype(int), inverse]
-        found = np.where((other >= 0)[:, None], corner[other], corner)
+        twin = np.where((other >= 0)[:, None], corner[other], corner)
         result = np.empty_like(self.face)
-        np.put_along_axis(result, order, found, 1)
+        np.put_along_axis(result, order, twin, 1)
         return np.where(other >= 0, other, np.arange(len(other))), result
 
     def facing(
@@ -137,7 +137,7 @@ class Occluder:
         away = np.flatnonzero(self._away(triangle, direction))
         if not away.size:
             return triangle, barycentric
-        partner, corner = (each[triangle[away]] for each in self._twin)
+        partner, corner = (table[triangle[away]] for table in self._twin)
         same = self.face[partner][:, :, None] == corner[:, None]
         triangle, barycentric = triangle.copy(), barycentric.copy()
         triangle[away], barycentric[away] = partner, np.einsum("nij,nj->ni", same, barycentric[away])
@@ -147,7 +147,7 @@ class Occluder:
         self, triangle: Integer[np.ndarray, " n"], direction: Float32[np.ndarray, "n 3"]
     ) -> Bool[np.ndarray, " n"]:
         """Whether rays hit triangles from behind, by the order of their corners."""
-        a, b, c = (self.position[self.face[triangle, each]] for each in range(3))
+        a, b, c = (self.position[self.face[triangle, corner]] for corner in range(3))
         return np.sum(np.cross(b - a, c - a) * direction, -1) > 0
 
     def blocked(
@@ -215,9 +215,9 @@ class Occluder:
             return partial.hit(np.ascontiguousarray(origin), np.ascontiguousarray(direction))
         with self._building:
             single = self._single
-        found = single.run(origin, direction, query="INTERSECT", output=True)
-        u, v = found["u"], found["v"]
-        return found["primID"].astype(np.int64), found["tfar"], np.stack([1 - u - v, u, v], -1)
+        hit = single.run(origin, direction, query="INTERSECT", output=True)
+        u, v = hit["u"], hit["v"]
+        return hit["primID"].astype(np.int64), hit["tfar"], np.stack([1 - u - v, u, v], -1)
 
 
 def offsets(position: Float32[np.ndarray, "v 3"], face: Integer[np.ndarray, "f k"]) -> Float32[np.ndarray, " f"]:

@@ -98,9 +98,9 @@ class Packets:
         way: Integer[np.ndarray, " n"],
     ) -> Bool[np.ndarray, " n"]:
         """Whether each ray hits a triangle. `Occluder.blocked` explains the arguments."""
-        found = np.empty(len(point), np.bool_)
-        _blocked(self._occluded, self._scene, self._arguments.ctypes.data, origin, direction, point, way, found)
-        return found
+        result = np.empty(len(point), np.bool_)
+        _blocked(self._occluded, self._scene, self._arguments.ctypes.data, origin, direction, point, way, result)
+        return result
 
 
 class Embree(NamedTuple):
@@ -223,7 +223,7 @@ def call(typing, address, valid, scene, ray, arguments):
         byte = llvmlite.ir.IntType(8).as_pointer()
         kind = llvmlite.ir.FunctionType(llvmlite.ir.VoidType(), [byte] * 4)
         function = builder.inttoptr(values[0], kind.as_pointer())
-        builder.call(function, [builder.inttoptr(each, byte) for each in values[1:]])
+        builder.call(function, [builder.inttoptr(value, byte) for value in values[1:]])
         return context.get_dummy_value()
 
     return types.none(*[types.intp] * 5), generate
@@ -260,7 +260,7 @@ def ray_buffers(rows):
 
 @no_type_check
 @compiled
-def _blocked(address, scene, arguments, origin, direction, point, way, found):
+def _blocked(address, scene, arguments, origin, direction, point, way, result):
     ray, valid = ray_buffers(12)
     for packet in range(0, len(point), 16):
         count = min(16, len(point) - packet)
@@ -273,7 +273,7 @@ def _blocked(address, scene, arguments, origin, direction, point, way, found):
         whole_ray(ray)
         call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
         for lane in range(count):
-            found[packet + lane] = ray[8, lane] < 0
+            result[packet + lane] = ray[8, lane] < 0
 
 
 @no_type_check
@@ -523,12 +523,12 @@ def _visible(query, memory, lamp, lamps, pattern, origin, sight, total, weight, 
             corner = lamp + stratum * 4 // strata
             for lane in range(16):
                 base = pattern[lane]
-                own = stratum * _QUARTERS + ((base >> 4) + stratum + turn & 3)
+                cell = stratum * _QUARTERS + ((base >> 4) + stratum + turn & 3)
                 # With other places in the next part, edges of shadows meet all places one after another.
-                within = (2 * (base + _STEP * own + 37 * lamp & 63) + 1) * width >> 7
-                number[lane] = first + own * width + within
+                within = (2 * (base + _STEP * cell + 37 * lamp & 63) + 1) * width >> 7
+                number[lane] = first + cell * width + within
                 spot[lane] = (base >> 2) + base + corner + turn & 3
-                piece[lane] = own * pieces // (strata * _QUARTERS)
+                piece[lane] = cell * pieces // (strata * _QUARTERS)
             new = _cast(query, memory, lamps, (number, spot, piece), origin, sight, weight, free)
             rays, open_ = rays + new[0], open_ + new[1]
     for lane in range(16):
@@ -586,16 +586,16 @@ def trace_lamps(query, surface, points, fields, lamps, first, last, result):
         _light_point(surface, points, fields, packet, lanes, origin, sight, pattern)
         row = 0
         for lamp in range(len(pieces)):
-            own = pieces[lamp]
+            count = pieces[lamp]
             _lit_share(lamp, lamps, center, normal, least, total, room)
-            lit = total[:own, 0].max() > 0
+            lit = total[:count, 0].max() > 0
             if lit:
                 _visible(query, memory, lamp, lamps, pattern, origin, sight, total, weight, free)
             else:
                 free[:] = 0
-            for piece in range(own):
+            for piece in range(count):
                 _write(total[piece], free[piece], normal, row + piece, packet, lanes, result)
-            row += own
+            row += count
 
 
 @no_type_check

@@ -103,7 +103,7 @@ def shares(mesh: Mesh, occluder: Occluder, points: PicturePoints, rays: TexelRay
 
 def point_fields(points: PicturePoints) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Triangles, barycentric coordinates and slopes of points, as the loops over packets take them."""
-    barycentric, slope = (np.ascontiguousarray(each, np.float32) for each in points[1:3])
+    barycentric, slope = (np.ascontiguousarray(value, np.float32) for value in points[1:3])
     return np.ascontiguousarray(points.triangle, np.int64), barycentric, slope
 
 
@@ -160,7 +160,7 @@ def moments(
 
     surface = occluder.position, np.asarray(mesh.normal, np.float32), occluder.face, occluder.offset
     drawn = *point_fields(points), dither_pattern(points)
-    fields = tuple(np.ascontiguousarray(each, np.float32) for each in (position, normal))
+    fields = tuple(np.ascontiguousarray(vector, np.float32) for vector in (position, normal))
     size = int(lamps.pieces.sum()), len(position)
     result = np.empty(size, np.float32), np.empty(size, np.float32), np.empty((size[0], 3, size[1]), np.float32)
     parts = [slice(i, min(i + _PART, len(position))) for i in range(0, len(position), _PART)]

@@ -210,16 +210,16 @@ class VisibilityJob(blocks.Job):
         vertex = chosen(mesh, vertex)
         occluder_rays = Occluder(shadowing)
         start = start_points(mesh, occluder_rays, apart=apart)[vertex]
-        normal, tangent = (np.asarray(each)[vertex] for each in (mesh.normal, mesh.tangent))
+        normal, tangent = (np.asarray(vector)[vertex] for vector in (mesh.normal, mesh.tangent))
         frame = frames(normal, tangent).astype(np.float32)
         # The key depends on the inputs only: computed values are rounded differently on other processors.
         region = (mesh.region,) if apart and np.ptp(mesh.region) else ()
         index = mesh.face, vertex, shadowing.face, *region
         opacity = () if shadowing.opacity is None else jax.tree.leaves(shadowing.opacity)
         key = blocks.fingerprint(*(np.asarray(array, np.int64) for array in index), *opacity)
-        given = {"mesh": (mesh.position, shadowing.position), "normals": (mesh.normal, mesh.tangent)}
-        rows = {name: np.concatenate([np.ravel(each) for each in both]) for name, both in given.items()}
-        near = {name: sketch(each, tolerance=ROUNDING) for name, each in rows.items()}
+        arrays = {"mesh": (mesh.position, shadowing.position), "normals": (mesh.normal, mesh.tangent)}
+        rows = {name: np.concatenate([np.ravel(array) for array in both]) for name, both in arrays.items()}
+        near = {name: sketch(value, tolerance=ROUNDING) for name, value in rows.items()}
         job = cls(start=start, frame=frame, occluder=shadowing, size=size, mesh_key=key, mesh_near=near, **more)
         vars(job)["rays"] = occluder_rays  # the cached property, so that Embree builds its tree once
         return job
@@ -363,9 +363,9 @@ def hemisphere_hits(
     direction = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)
     point, texel = np.nonzero(normal @ area.T > 0)
     triangle, _, barycentric = occluder.hit(start[point], direction[texel])
-    met = np.flatnonzero(triangle >= 0)
-    corner = occluder.facing(triangle[met], direction[texel[met]])
-    return point[met], texel[met], corner, barycentric[met], len(point)
+    hit = np.flatnonzero(triangle >= 0)
+    corner = occluder.facing(triangle[hit], direction[texel[hit]])
+    return point[hit], texel[hit], corner, barycentric[hit], len(point)
 
 
 def hits_front(
@@ -401,8 +401,8 @@ def first_fronts(
         direction: Unit directions.
     """
     triangle, _, barycentric = occluder.hit(start, direction)
-    met = np.flatnonzero(triangle >= 0)
-    triangle[met], barycentric[met] = occluder.toward(triangle[met], direction[met], barycentric[met])
-    triangle[met[~hits_front(occluder, normal, occluder.face[triangle[met]], direction[met])]] = -1
+    hit = np.flatnonzero(triangle >= 0)
+    triangle[hit], barycentric[hit] = occluder.toward(triangle[hit], direction[hit], barycentric[hit])
+    triangle[hit[~hits_front(occluder, normal, occluder.face[triangle[hit]], direction[hit])]] = -1
     weight = np.clip(barycentric, 0, 1)
     return triangle, weight / np.maximum(weight.sum(1, keepdims=True), 1e-6)

@@ -48,17 +48,17 @@ _TURNS = ((0.5, 0.3), (2.6, 0.6), (4.7, 0.15))  # azimuth and elevation of the c
 _CLOSER = ((0.9, 0.4), (3.6, 0.25))  # and around parts
 
 
-def cameras(mesh: Mesh, given: Sequence[Camera], parts: Sequence[Mesh]) -> list[Camera]:
+def cameras(mesh: Mesh, scene_cameras: Sequence[Camera], parts: Sequence[Mesh]) -> list[Camera]:
     """Cameras from which a scene is likely to be seen: its own, some around it, and some around its parts.
 
     Args:
         mesh: The mesh of all parts.
-        given: The cameras of the scene.
+        scene_cameras: The cameras of the scene.
         parts: The meshes of the parts.
     """
     size = {"width": EDGE, "height": EDGE}
     around = [orbit(mesh, azimuth=azimuth, elevation=elevation, **size) for azimuth, elevation in _TURNS]
-    chosen = [*given[: _MOST // 2], *around]
+    chosen = [*scene_cameras[: _MOST // 2], *around]
     # Parts with many triangles are what scenes are about.
     solid = [part for part in parts if len(part.face)] if len(parts) > 1 else []
     order = sorted(solid, key=lambda part: -len(part.face))
@@ -94,7 +94,7 @@ def places(mesh: Mesh, occluder: Occluder, views: Sequence[Camera]) -> tuple[Poi
 
 def _rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """The eye, and unit directions through the pixels of a small picture of the camera's shape."""
-    eye, target, up = (np.asarray(each, np.float64) for each in (camera.eye, camera.target, camera.up))
+    eye, target, up = (np.asarray(vector, np.float64) for vector in (camera.eye, camera.target, camera.up))
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, up)
     if np.linalg.norm(right) < 1e-6 * max(np.linalg.norm(up), 1e-30):
@@ -260,13 +260,13 @@ class _Surface:
         area = self._area()
         area = area / max(area.sum(), np.finfo(np.float64).tiny)
         even = subdivision.scatter(np.where(self._coarse, points * area, 0).astype(np.int64))
-        own = self._coarse[seen[0].triangle]
+        coarse = self._coarse[seen[0].triangle]
         of_pictures = np.bincount(seen[0].triangle, seen[1], len(area))
-        self._shown = seen[1][own].sum() > 0
+        self._shown = seen[1][coarse].sum() > 0
         self.share = _UNSEEN * area + (1 - _UNSEEN) * of_pictures if self._shown else area
         pairs = zip(even, seen[0], strict=True)
-        self._points = subdivision.Points(*(np.concatenate([one, other[own]]) for one, other in pairs))
-        self._picture = np.concatenate([np.zeros(len(even.triangle)), seen[1][own]])
+        self._points = subdivision.Points(*(np.concatenate([one, other[coarse]]) for one, other in pairs))
+        self._picture = np.concatenate([np.zeros(len(even.triangle)), seen[1][coarse]])
         self._at_points, self._inside = self._traced_points()
         self.error = np.zeros((len(self.face), self.light.shape[1]))
         self._measure(np.flatnonzero(self._coarse))
@@ -330,11 +330,11 @@ class _Surface:
         """Computes the error of some triangles. Traces rays where the radiance is not known."""
         self._trace_middles(changed)
         for first in range(0, len(changed), _FACES):
-            own = changed[first : first + _FACES]
-            apart = self.differences(self.face[own]).astype(np.float64)
+            faces = changed[first : first + _FACES]
+            apart = self.differences(self.face[faces]).astype(np.float64)
             square, both = np.sum(apart**2, (1, 3)), np.sum(np.sum(apart, 1) ** 2, -1)
             # Mean, over a triangle, of the square of a quadratic function that is zero at the corners.
-            self.error[own] = 4 / 45 * (square + both)
+            self.error[faces] = 4 / 45 * (square + both)
         # Where there are points inside, the midpoints count as three more.
         again = np.zeros(len(self.face), bool)
         again[changed] = True
@@ -374,14 +374,14 @@ class _Surface:
         triangle, weight = self._points
         corner = self.face[triangle]
         place, normal = (
-            np.einsum("pk,pkc->pc", weight, np.asarray(each, np.float64)[corner])
-            for each in (self.position, self.normal)
+            np.einsum("pk,pkc->pc", weight, np.asarray(attribute, np.float64)[corner])
+            for attribute in (self.position, self.normal)
         )
         light = np.zeros((len(triangle), *self.light.shape[1:]), self.light.dtype)
         inside = np.zeros(len(triangle), bool)
         sheet = self._tracer.double[triangle]
-        for own, traced in ((np.flatnonzero(~sheet), self._beside), (np.flatnonzero(sheet), self._on_sheets)):
-            light[own], inside[own] = traced(triangle[own], place[own], normal[own])
+        for rows, traced in ((np.flatnonzero(~sheet), self._beside), (np.flatnonzero(sheet), self._on_sheets)):
+            light[rows], inside[rows] = traced(triangle[rows], place[rows], normal[rows])
         return light, inside
 
     def _beside(

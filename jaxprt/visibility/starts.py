@@ -57,11 +57,11 @@ def out_of_solids(
         return start, buried
     vertex, goal = _ways(mesh, start, buried)
     place, length = _outside(occluder, start[vertex], goal, out[vertex], offset[vertex, 0])
-    found = np.flatnonzero(np.isfinite(length))
-    found = found[np.lexsort((length[found], vertex[found]))]
-    found = found[np.unique(vertex[found], return_index=True)[1]]  # the nearest place of each vertex
+    reachable = np.flatnonzero(np.isfinite(length))
+    reachable = reachable[np.lexsort((length[reachable], vertex[reachable]))]
+    reachable = reachable[np.unique(vertex[reachable], return_index=True)[1]]  # the nearest place of each vertex
     result = start.copy()
-    result[vertex[found]] = place[found]
+    result[vertex[reachable]] = place[reachable]
     return result, buried
 
 
@@ -74,8 +74,8 @@ def _normals(occluder: Occluder) -> Float32[np.ndarray, "f 3"]:
 def _hit(occluder: Occluder, start: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The first triangle on each ray, -1 for none, and its distance. Of the two sides of a sheet no ray hits a back."""
     triangle, distance, weight = occluder.hit(start, way)
-    met = np.flatnonzero(triangle >= 0)
-    triangle[met] = occluder.toward(triangle[met], way[met], weight[met])[0]
+    hit = np.flatnonzero(triangle >= 0)
+    triangle[hit] = occluder.toward(triangle[hit], way[hit], weight[hit])[0]
     return triangle, distance
 
 

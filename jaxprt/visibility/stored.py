@@ -71,10 +71,10 @@ class StoredVisibility(eqx.Module):
         level = np.empty((len(vertex), self.texels), np.uint8)
         held = np.asarray(self.level)
         for number in np.unique(block):  # Whole blocks are contiguous in memory, single vertices are not.
-            own = np.flatnonzero(block == number)
+            rows = np.flatnonzero(block == number)
             pair = np.ascontiguousarray(held[number].T)
-            level[own] = np.where(
-                place[own, None] < _HALF, pair[place[own] % _HALF] & 15, pair[place[own] % _HALF] >> 4
+            level[rows] = np.where(
+                place[rows, None] < _HALF, pair[place[rows] % _HALF] & 15, pair[place[rows] % _HALF] >> 4
             )
         level += level > _MIDDLE
         return level

@@ -159,41 +159,41 @@ def split_parts(
     region = np.zeros(len(geometry.position), int) if geometry.region is None else geometry.region
     vertices = rows_of(region, np.arange(len(names)))
     return [
-        _part(name, mesh, material, geometry, own)
-        for name, mesh, material, own in zip(numbered(names), meshes, materials, vertices, strict=True)
+        _part(name, mesh, material, geometry, vertex)
+        for name, mesh, material, vertex in zip(numbered(names), meshes, materials, vertices, strict=True)
     ]
 
 
-def _part(name: str, mesh: Mesh, material: TexturedMaterial, geometry: Geometry, own: np.ndarray) -> Part:
+def _part(name: str, mesh: Mesh, material: TexturedMaterial, geometry: Geometry, vertex: np.ndarray) -> Part:
     """A part of some vertices of a file's geometry."""
 
     def rows(value: np.ndarray | None, plain: int) -> np.ndarray | None:
         """The part's rows of a vertex attribute; None if all have the default value."""
-        return None if value is None or (value[own] == plain).all() else value[own]
+        return None if value is None or (value[vertex] == plain).all() else value[vertex]
 
     second, side = rows(geometry.second, 0), rows(geometry.handedness, 1)
-    sets = {each.set for each in material.textures}
+    sets = {source.set for source in material.textures}
     if 1 in sets and second is None:
         second = np.zeros((len(mesh.position), 2))
     if 0 in sets and mesh.texture is None:
         zero = _array(np.zeros((len(mesh.position), 2)))
-        mesh = eqx.tree_at(lambda each: each.texture, mesh, zero, is_leaf=lambda each: each is None)
+        mesh = eqx.tree_at(lambda m: m.texture, mesh, zero, is_leaf=lambda m: m is None)
     source = material.normal_texture or material.anisotropy_texture
     place = second if source is not None and source.set else mesh.texture
     if place is not None and (source is not None or material.anisotropy > 0):
-        given = np.zeros(len(place), bool) if geometry.tangent is None else (geometry.tangent[own] != 0).any(axis=1)
-        mesh, side = _with_tangents(mesh, place, given, side)
+        stated = np.zeros(len(place), bool) if geometry.tangent is None else (geometry.tangent[vertex] != 0).any(axis=1)
+        mesh, side = _with_tangents(mesh, place, stated, side)
     alpha = None if material.alpha_mode == "opaque" else rows(geometry.alpha, 1)
     return Part(name, mesh, material, _array(rows(geometry.color, 1)), _array(second), _array(side), _array(alpha))
 
 
 def _with_tangents(
-    mesh: Mesh, place: np.ndarray | Array, given: np.ndarray, side: np.ndarray | None
+    mesh: Mesh, place: np.ndarray | Array, stated: np.ndarray, side: np.ndarray | None
 ) -> tuple[Mesh, np.ndarray]:
     """The mesh with tangents along u where the file has none, and the handedness of all vertices."""
     image = Mesh(mesh.position, mesh.face, mesh.normal, mesh.tangent, mesh.region, jnp.asarray(place, jnp.float32))
-    along = np.where(given[:, None], mesh.tangent, texture.dpdu(image))
-    return brush(mesh, along), np.where(given, 1 if side is None else side, texture.handedness(image))
+    along = np.where(stated[:, None], mesh.tangent, texture.dpdu(image))
+    return brush(mesh, along), np.where(stated, 1 if side is None else side, texture.handedness(image))
 
 
 def _array(value: np.ndarray | Array | None) -> Array | None:

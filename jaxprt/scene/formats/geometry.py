@@ -146,10 +146,10 @@ def joined(geometries: Sequence[Geometry]) -> Geometry:
     """Joins one or more geometries into one, in order."""
     if len(geometries) == 1:
         return geometries[0]
-    start = np.cumsum([0, *(len(each.position) for each in geometries)])
-    face = np.concatenate([each.face + first for each, first in zip(geometries, start[:-1], strict=True)])
+    start = np.cumsum([0, *(len(geometry.position) for geometry in geometries)])
+    face = np.concatenate([geometry.face + first for geometry, first in zip(geometries, start[:-1], strict=True)])
     field = {name: _column(geometries, name, *missing) for name, missing in _MISSING.items()}
-    return Geometry(np.concatenate([each.position for each in geometries]), face, **field)
+    return Geometry(np.concatenate([geometry.position for geometry in geometries]), face, **field)
 
 
 def rows_of(region: np.ndarray, numbers: np.ndarray) -> list[np.ndarray]:
@@ -164,13 +164,13 @@ def rows_of(region: np.ndarray, numbers: np.ndarray) -> list[np.ndarray]:
 
 
 def _column(geometries: Sequence[Geometry], name: str, shape: tuple[int, ...], value: float) -> np.ndarray | None:
-    each = [getattr(geometry, name) for geometry in geometries]
-    if all(array is None for array in each):
+    columns = [getattr(geometry, name) for geometry in geometries]
+    if all(array is None for array in columns):
         return None
     return np.concatenate(
         [
             np.full((len(geometry.position), *shape), value) if array is None else array
-            for array, geometry in zip(each, geometries, strict=True)
+            for array, geometry in zip(columns, geometries, strict=True)
         ]
     )
 

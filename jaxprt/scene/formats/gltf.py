@@ -361,8 +361,8 @@ def read_lights(
             ignored.add(f"lights of type {excerpt(kind)}")
         if "range" in item and kind != "directional":
             ignored.add(_RANGE)
-    given = [str(item.get("name") or owner).encode(errors="replace").decode() for item, owner, _ in placed]
-    unique = numbered([*names, *given])[len(names) :]
+    labels = [str(item.get("name") or owner).encode(errors="replace").decode() for item, owner, _ in placed]
+    unique = numbered([*names, *labels])[len(names) :]
     points, suns = [], []
     for (item, owner, node), name in zip(placed, unique, strict=True):
         color = document.numbers(item.get("color", [1.0] * 3), (3,), f"the color of {owner}")

@@ -87,15 +87,15 @@ class MaterialMaker:
             ValueError: The BSDF has an unsupported type, or a reference is missing.
         """
         field: dict[str, Any] = {"base_color": 0.5, "metallic": 0.0, "specular": 0.0}
-        for key, each in item.items():
-            found = self._resolved(each, name)
-            if found is None:
+        for key, value in item.items():
+            plugin = self._resolved(value, name)
+            if plugin is None:
                 continue
-            if found.get("type") == "area":
-                field["emissive"] = rgb(found.get("radiance", 1.0), f"radiance of {name}")
+            if plugin.get("type") == "area":
+                field["emissive"] = rgb(plugin.get("radiance", 1.0), f"radiance of {name}")
             elif key != "to_world":
                 emissive = {"emissive": field["emissive"]} if "emissive" in field else {}
-                field = self._field(found, f"{key} of {name}") | emissive
+                field = self._field(plugin, f"{key} of {name}") | emissive
         try:
             return TexturedMaterial(**field)
         except ValueError as error:
@@ -107,10 +107,10 @@ class MaterialMaker:
             return None
         if item.get("type") != "ref":
             return item
-        found = self._scene.get(str(item.get("id")))
-        if not isinstance(found, Mapping):
+        target = self._scene.get(str(item.get("id")))
+        if not isinstance(target, Mapping):
             raise ValueError(f"{name} must refer to something in the scene, got {item.get('id')!r}")
-        return found
+        return target
 
     def _field(self, item: Mapping[str, Any], name: str) -> dict[str, Any]:
         """Factors and textures of the material for a BSDF."""
@@ -123,8 +123,8 @@ class MaterialMaker:
                 wrapped = {"alpha_mode": "blend"} | self._opacity(item, name)
             else:
                 self._ignored.add(f"{kind} in {name}")
-            for each in item.values():
-                inner = self._resolved(each, name)
+            for value in item.values():
+                inner = self._resolved(value, name)
                 if inner is not None and inner.get("type") in _MAKERS | _WRAPPERS:
                     return self._field(inner, name) | wrapped
         if kind not in _MAKERS:
@@ -358,7 +358,7 @@ def _cube(item: Mapping[str, Any]) -> Geometry:
         texture.append(np.concatenate([u, 1 - v], 1))
         side = 1 if np.cross(across, along) @ front > 0 else -1
         faces.append(face[:, ::side] + number * len(u))
-    return Geometry(*(np.concatenate(each) for each in (position, faces, normal)), texture=np.concatenate(texture))
+    return Geometry(*(np.concatenate(rows) for rows in (position, faces, normal)), texture=np.concatenate(texture))
 
 
 def _sphere(item: Mapping[str, Any]) -> Geometry:
@@ -378,7 +378,9 @@ def _camera(name: str, item: Mapping[str, Any], ignored: set[str]) -> Camera:
     if item["type"] == "thinlens":
         ignored.add(f"the aperture of {name}")
     ignored |= {f"{key} of {name}" for key in item if key.startswith("principal_point_offset") and item[key]}
-    film = next((each for each in item.values() if isinstance(each, Mapping) and "film" in str(each.get("type"))), {})
+    film = next(
+        (value for value in item.values() if isinstance(value, Mapping) and "film" in str(value.get("type"))), {}
+    )
     ignored |= {f"{key} of {name}" for key in film if key.startswith("crop_")}
     width, height = int(film.get("width", 768)), int(film.get("height", 576))
     if "fov" not in item:
@@ -408,4 +410,4 @@ def _environment(name: str, item: Mapping[str, Any]) -> Environment:
         raise ValueError(f"to_world of {name} must be a pure rotation, got {turned.tolist()}")
     if not np.allclose(turned, np.eye(3), rtol=0, atol=1e-7):
         light = environment.rotate(light, jnp.asarray(turned, jnp.float32))
-    return eqx.tree_at(lambda each: each.radiance, light, light.radiance * float(item.get("scale", 1.0)))
+    return eqx.tree_at(lambda e: e.radiance, light, light.radiance * float(item.get("scale", 1.0)))

@@ -358,10 +358,10 @@ def _exponent(line: str) -> float | None:
 
     None for other programs, and for Blender before 2.80, which had Phong materials.
     """
-    found = _BLENDER.match(line)
-    if found is None or (version := (int(found[2]), int(found[3]))) < (2, 80):
+    match = _BLENDER.match(line)
+    if match is None or (version := (int(match[2]), int(match[3]))) < (2, 80):
         return None
-    return 1000.0 if version >= (3, 3) and not found[1] else 900.0
+    return 1000.0 if version >= (3, 3) and not match[1] else 900.0
 
 
 def read_mtl(
@@ -478,7 +478,7 @@ def _opacity(
     return {"alpha": alpha, "alpha_mode": "blend"}
 
 
-def _principled(value: dict[str, Any], given: Collection[str], exponent: float) -> dict[str, Any]:
+def _principled(value: dict[str, Any], stated: Collection[str], exponent: float) -> dict[str, Any]:
     """Factors of Blender's principled material, from the values that Blender's exporter writes.
 
     Blender's importer uses the same inverse: source/blender/io/wavefront_obj/importer/obj_import_mtl.cc.
@@ -493,7 +493,7 @@ def _principled(value: dict[str, Any], given: Collection[str], exponent: float) 
         "specular_color": 2 * specular,  # Blender reflects 4 % at 0.5, this package at 1
     }
     return factor | {
-        key: 1.0 for key in ("base_color", "roughness", "metallic", "emissive") if f"{key}_texture" in given
+        key: 1.0 for key in ("base_color", "roughness", "metallic", "emissive") if f"{key}_texture" in stated
     }
 
 
@@ -515,7 +515,7 @@ def _number(statements: dict[str, list[str]], key: str, path: pathlib.Path, name
         if not words or words[0] in ("spectral", "xyz"):
             raise ValueError
         number = [float(word) for word in words[: 3 if key in _COLORS else 1]]
-        if not all(math.isfinite(each) for each in number):
+        if not all(math.isfinite(value) for value in number):
             raise ValueError
     except ValueError:
         got = " ".join([key, *words])
@@ -554,8 +554,8 @@ def _add_map(
     if name == "normal_texture" and len(strength) == 1 and _is_number(strength[0]):
         honored |= {"-bm"}
         field["normal_scale"] = float(strength[0])
-    ignored |= {f"option {each} of maps" for each in options.keys() - honored}
-    scale, offset = (_pair(options.get(each, []), plain) for each, plain in (("-s", 1.0), ("-o", 0.0)))
+    ignored |= {f"option {option} of maps" for option in options.keys() - honored}
+    scale, offset = (_pair(options.get(option, []), plain) for option, plain in (("-s", 1.0), ("-o", 0.0)))
     wrap = "clamp" if options.get("-clamp") == ["on"] else "repeat"
     with np.errstate(over="ignore"):  # textures refuse what is not finite
         transform = np.array([[scale[0], 0, offset[0]], [0, scale[1], offset[1]]]).astype(np.float32)
