@@ -64,7 +64,7 @@ _KINDS = {".html": "page", ".glb": "baked", ".json": "probes"}
     help="Folder that keeps precomputed data for later runs.",
 )
 @options.as_json
-def command(**given: Any) -> None:
+def command(**arguments: Any) -> None:
     """Write a scene or its lights for other programs.
 
     \b
@@ -78,12 +78,12 @@ def command(**given: Any) -> None:
       jaxprt export scene.glb grace.hdr --output piece.html --output baked.glb --system harmonic --store kept
       jaxprt export grace.hdr uffizi.hdr --output probes.json --tool three.js
     """  # noqa: D301
-    chosen = SimpleNamespace(**given)
+    chosen = SimpleNamespace(**arguments)
     _check(chosen)
     with options.telling(chosen.as_json):
-        found = _write(chosen)
-    rows = [f"jaxprt: {row['path']}, {row['bytes']:,} bytes{row.pop('words')}" for row in found]
-    options.tell(found, "\n".join(rows), as_json=chosen.as_json)
+        files = _write(chosen)
+    rows = [f"jaxprt: {row['path']}, {row['bytes']:,} bytes{row.pop('words')}" for row in files]
+    options.tell(files, "\n".join(rows), as_json=chosen.as_json)
 
 
 def _check(chosen: SimpleNamespace) -> None:
@@ -143,10 +143,10 @@ def _write(chosen: SimpleNamespace) -> list[dict[str, Any]]:
 
 def probes(path: Path, lights: dict[str, Environment], tools: tuple[str, ...]) -> dict[str, Any]:
     """Writes light probes. Returns a description of the file."""
-    found = {
+    content = {
         tool: {name: np.asarray(light_probe(light, tool=tool), float).tolist() for name, light in lights.items()}
         for tool in tools
     }
-    outputs.write(path, json.dumps(found, indent=2) + "\n")
+    outputs.write(path, json.dumps(content, indent=2) + "\n")
     words = f", nine colors of each of {', '.join(lights)} for {', '.join(tools)}"
     return {"path": str(path), "kind": "probes", "bytes": path.stat().st_size, "words": words}

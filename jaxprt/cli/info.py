@@ -48,7 +48,7 @@ _NAMES = 6  # most names of a file's materials that the text lists
 )
 @options.outside
 @options.as_json
-def command(**given: Any) -> None:
+def command(**arguments: Any) -> None:
     """Describe the content of files: meshes and scenes, environments, BRDFs, and folders written by jaxprt.
 
     Without files, describe the installation: versions, the device, and whether its compiler computes right sums.
@@ -60,20 +60,20 @@ def command(**given: Any) -> None:
       jaxprt info lafortune.json ngan2005_wardduer.fit gold-paint.binary
       jaxprt info kept out/ --json
     """  # noqa: D301
-    chosen = SimpleNamespace(**given)
+    chosen = SimpleNamespace(**arguments)
     if not chosen.files:
         here = installation()
         options.tell(here, _installed(here), as_json=chosen.as_json)
         if here["wrong_sums"]:
             raise ValueError(_WRONG)
         return
-    found, refused = [], []
+    facts, refused = [], []
     for path in chosen.files:
         try:
-            found.append(about(path, chosen.light_size, outside=chosen.outside))
+            facts.append(about(path, chosen.light_size, outside=chosen.outside))
         except (ValueError, OSError) as error:
             refused.append(options.said(error))
-    options.tell(found, "\n".join(map(_text, found)), as_json=chosen.as_json)
+    options.tell(facts, "\n".join(map(_text, facts)), as_json=chosen.as_json)
     if refused:
         raise ValueError("\n".join(refused))
 
@@ -126,7 +126,7 @@ def _about(path: Path, light_size: int, outside: bool) -> dict[str, Any]:
 
 def _scene(path: Path, outside: bool) -> dict[str, Any]:
     scene = load_scene(path, outside=outside)
-    low, high = (np.asarray(each, float).tolist() for each in bounds(scene.mesh))
+    low, high = (np.asarray(corner, float).tolist() for corner in bounds(scene.mesh))
     parts = [
         {
             "name": part.name,
@@ -140,11 +140,11 @@ def _scene(path: Path, outside: bool) -> dict[str, Any]:
     ]
     cameras = [
         {
-            "eye": np.asarray(each.eye, float).tolist(),
-            "target": np.asarray(each.target, float).tolist(),
-            "field_of_view_degrees": float(np.degrees(each.field_of_view)),
+            "eye": np.asarray(camera.eye, float).tolist(),
+            "target": np.asarray(camera.target, float).tolist(),
+            "field_of_view_degrees": float(np.degrees(camera.field_of_view)),
         }
-        for each in scene.cameras
+        for camera in scene.cameras
     ]
     total = {name: sum(part[name] for part in parts) for name in ("vertices", "triangles")}
     return {"kind": "scene", **total, "bounds": [low, high], "parts": parts, "cameras": cameras}
@@ -192,9 +192,9 @@ def _brdf(path: Path) -> dict[str, Any]:
         return _named("lafortune", path, names)
     if "Aggregate(Lambertian(" in text:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-        names = [found[1] for found in (re.match(r"([\w-]+) *= *Aggregate", each) for each in lines) if found]
-        found = _named("ngan", path, names)
-        return {**found, "model": type(brdf.load_ngan(path, names[0])).__name__}
+        names = [match[1] for match in (re.match(r"([\w-]+) *= *Aggregate", line) for line in lines) if match]
+        facts = _named("ngan", path, names)
+        return {**facts, "model": type(brdf.load_ngan(path, names[0])).__name__}
     if path.suffix.lower() == ".brdf":
         samples = len(brdf.scattered.read_scattered(path)[0])
         return {"kind": "brdf", "form": "scattered", "samples": samples, "use": f"scattered:{path}"}
@@ -211,16 +211,20 @@ def _named(form: str, path: Path, names: list[str]) -> dict[str, Any]:
 
 def _folder(path: Path) -> dict[str, Any]:
     """Describes a saved object, a store of blocks, or a folder that contains such objects or stores."""
-    nbytes = sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
+    nbytes = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
     if (path / "object.json").exists() or (path / "store.json").exists():
         try:
             return _written(path, nbytes)
         except Exception as error:
             raise ValueError(f"{path} is damaged: {error}") from error
-    inside = sorted({each.parent for name in ("object.json", "store.json") for each in path.rglob(name)})
+    inside = sorted({file.parent for name in ("object.json", "store.json") for file in path.rglob(name)})
     if not inside:
         raise ValueError(f"{path} must be a folder that jaxprt wrote, got one without saved objects and stores")
-    return {"kind": "folder", "bytes": nbytes, "inside": [{"path": str(each), **_folder(each)} for each in inside]}
+    return {
+        "kind": "folder",
+        "bytes": nbytes,
+        "inside": [{"path": str(folder), **_folder(folder)} for folder in inside],
+    }
 
 
 def _written(path: Path, nbytes: int) -> dict[str, Any]:
@@ -242,31 +246,33 @@ def _written(path: Path, nbytes: int) -> dict[str, Any]:
     }
 
 
-def _text(found: dict[str, Any], indent: str = "") -> str:
+def _text(facts: dict[str, Any], indent: str = "") -> str:
     """The description as text."""
-    rows = {"scene": _scene_rows, "environment": _light_rows, "brdf": _brdf_rows}.get(found["kind"], _folder_rows)(
-        found
+    rows = {"scene": _scene_rows, "environment": _light_rows, "brdf": _brdf_rows}.get(facts["kind"], _folder_rows)(
+        facts
     )
-    rows = [f"{indent}{found['path']}: {rows[0]}", *(f"{indent}  {row}" for row in rows[1:])]
-    rows += [f"{indent}  left out: {each}" for each in found.get("left_out", [])]
-    return "\n".join([*rows, *(_text(each, f"{indent}  ") for each in found.get("inside", []))])
+    rows = [f"{indent}{facts['path']}: {rows[0]}", *(f"{indent}  {row}" for row in rows[1:])]
+    rows += [f"{indent}  left out: {reason}" for reason in facts.get("left_out", [])]
+    return "\n".join([*rows, *(_text(part, f"{indent}  ") for part in facts.get("inside", []))])
 
 
-def _scene_rows(found: dict[str, Any]) -> list[str]:
-    (low, high), cameras = found["bounds"], len(found["cameras"])
+def _scene_rows(facts: dict[str, Any]) -> list[str]:
+    (low, high), cameras = facts["bounds"], len(facts["cameras"])
     size = " x ".join(f"{b - a:.4g}" for a, b in zip(low, high, strict=True))
     rows = [
-        f"scene of {len(found['parts'])} parts, {found['vertices']} vertices, {found['triangles']} triangles, "
+        f"scene of {len(facts['parts'])} parts, {facts['vertices']} vertices, {facts['triangles']} triangles, "
         f"{size} units, {cameras} cameras"
     ]
-    for number, part in enumerate(found["parts"]):
-        own = part["material"]
-        values = [f"{name} {_value(value)}" for name, value in own.items() if name != "model" and _matters(name, value)]
+    for number, part in enumerate(facts["parts"]):
+        material = part["material"]
+        values = [
+            f"{name} {_value(value)}" for name, value in material.items() if name != "model" and _matters(name, value)
+        ]
         rows.append(
             f"{number} {part['name']!r}: {part['vertices']} vertices, {part['triangles']} triangles, "
-            f"{own['model']}({', '.join(values)})"
+            f"{material['model']}({', '.join(values)})"
         )
-    for number, camera in enumerate(found["cameras"]):
+    for number, camera in enumerate(facts["cameras"]):
         eye = _value(camera["eye"])
         rows.append(f"camera {number}: at {eye}, {camera['field_of_view_degrees']:.4g} degrees high")
     return rows
@@ -274,7 +280,7 @@ def _scene_rows(found: dict[str, Any]) -> list[str]:
 
 def _matters(name: str, value: Any) -> bool:
     """Whether a parameter of a material differs from its default in glTF."""
-    default = {key: each for key, each in inputs.describe(TexturedMaterial()).items() if key != "model"}
+    default = {key: standard for key, standard in inputs.describe(TexturedMaterial()).items() if key != "model"}
     return name not in default or not np.array_equal(value, default[name])
 
 
@@ -284,35 +290,35 @@ def _value(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _light_rows(found: dict[str, Any]) -> list[str]:
-    width, height = found["pixels"]
-    least, most = found["radiance"].values()
-    shares = ", ".join(f"{n}: {100 * share:.1f} %" for n, share in found["brightest_share"].items())
-    size = found["texels"][1]
+def _light_rows(facts: dict[str, Any]) -> list[str]:
+    width, height = facts["pixels"]
+    least, most = facts["radiance"].values()
+    shares = ", ".join(f"{n}: {100 * share:.1f} %" for n, share in facts["brightest_share"].items())
+    size = facts["texels"][1]
     return [
-        f"environment of {width} x {height} pixels, {found['channels']} channels, layout {found['layout']}",
-        f"radiance from {least:.4g} to {most:.4g}, mean over the sphere {_value(found['mean_radiance'])}",
+        f"environment of {width} x {height} pixels, {facts['channels']} channels, layout {facts['layout']}",
+        f"radiance from {least:.4g} to {most:.4g}, mean over the sphere {_value(facts['mean_radiance'])}",
         f"share of the light in the brightest of 6 x {size} x {size} texels: {shares}",
     ]
 
 
-def _brdf_rows(found: dict[str, Any]) -> list[str]:
-    names, rows = found.get("materials", []), []
-    if found["form"] == "scattered":
-        rows.append(f"scattered measurements, {found['samples']} samples")
+def _brdf_rows(facts: dict[str, Any]) -> list[str]:
+    names, rows = facts.get("materials", []), []
+    if facts["form"] == "scattered":
+        rows.append(f"scattered measurements, {facts['samples']} samples")
     elif names:
         rows.append(
-            f"BRDFs ({found['form']}) of {len(names)} materials: {', '.join(names[:_NAMES])}"
+            f"BRDFs ({facts['form']}) of {len(names)} materials: {', '.join(names[:_NAMES])}"
             f"{', ..' if len(names) > _NAMES else ''}"
         )
-        rows += [f"model: {found['model']}"] if "model" in found else []
+        rows += [f"model: {facts['model']}"] if "model" in facts else []
     else:
-        rows.append(f"BRDF (MERL), {100 * found['brdf']['filled']:.1f} % of its cells above the horizon filled")
-    return [*rows, f"use: --brdf {found['use']}"] if found["use"] else rows
+        rows.append(f"BRDF (MERL), {100 * facts['brdf']['filled']:.1f} % of its cells above the horizon filled")
+    return [*rows, f"use: --brdf {facts['use']}"] if facts["use"] else rows
 
 
-def _folder_rows(found: dict[str, Any]) -> list[str]:
-    if found["kind"] == "folder":
-        return [f"folder of {len(found['inside'])} objects and stores, {found['bytes']:,} bytes"]
-    rows = f"{found['kind']} of {found['holds']}, {found['bytes']:,} bytes"
-    return [f"{rows}, {found['finished']} of {found['blocks']} blocks are finished" if "blocks" in found else rows]
+def _folder_rows(facts: dict[str, Any]) -> list[str]:
+    if facts["kind"] == "folder":
+        return [f"folder of {len(facts['inside'])} objects and stores, {facts['bytes']:,} bytes"]
+    rows = f"{facts['kind']} of {facts['holds']}, {facts['bytes']:,} bytes"
+    return [f"{rows}, {facts['finished']} of {facts['blocks']} blocks are finished" if "blocks" in facts else rows]

@@ -82,20 +82,20 @@ def parse(text: str) -> Callable | TexturedMaterial:
     if name not in MODELS:
         names = ", ".join(dict.fromkeys([*MODELS, *FILES]))
         raise ValueError(f"a material must be one of {names}, got {name!r}")
-    kind, given = MODELS[name], {}
+    kind, arguments = MODELS[name], {}
     known = parameters(name)
     for word in words:
         key, equals, value = word.partition("=")
         key = _ALIASES.get(key, key) if "along" in known else key
         if not equals or key not in known:
-            raise ValueError(f"{name} takes {', '.join(f'{each}=' for each in known)}, got {word!r}")
-        if key in given:
+            raise ValueError(f"{name} takes {', '.join(f'{parameter}=' for parameter in known)}, got {word!r}")
+        if key in arguments:
             raise ValueError(f"{name} takes each parameter once, got {key} twice")
-        given[key] = _numbers(name, key, value)
-    missing = [key for key, default in known.items() if default is None and key not in given]
+        arguments[key] = _numbers(name, key, value)
+    missing = [key for key, default in known.items() if default is None and key not in arguments]
     if missing:
-        raise ValueError(f"{name} must have {', '.join(f'{each}=' for each in missing)}, got {text!r}")
-    return kind(**given)
+        raise ValueError(f"{name} must have {', '.join(f'{parameter}=' for parameter in missing)}, got {text!r}")
+    return kind(**arguments)
 
 
 def parameters(name: str) -> dict[str, float | None]:
@@ -139,16 +139,16 @@ def _measured(name: str, words: list[str]) -> Callable:
     load, takes = FILES[name]
     if not words or "=" in words[0]:
         raise ValueError(f"{name} must name a file, {form(name)}, got {', '.join(words) or 'none'}")
-    given: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
     for word in words[1:]:
         key, equals, value = word.partition("=")
-        if not equals or key not in takes or key in given:
+        if not equals or key not in takes or key in arguments:
             raise ValueError(f"{name} takes {form(name)}, got {word!r}")
-        given[key] = _material_number(name, key, value) if key == "smoothing" else value
-    if any(needed and key not in given for key, needed in takes.items()):
+        arguments[key] = _material_number(name, key, value) if key == "smoothing" else value
+    if any(needed and key not in arguments for key, needed in takes.items()):
         # A name that no file has, so that the loader's error message lists existing ones.
-        given["material"] = ""
-    return load(Path(words[0]), **given)
+        arguments["material"] = ""
+    return load(Path(words[0]), **arguments)
 
 
 def form(name: str) -> str:
@@ -159,7 +159,7 @@ def form(name: str) -> str:
 
 def _numbers(name: str, key: str, text: str) -> Any:
     """Parses a number, a color r/g/b, or several of them separated by colons."""
-    rows = [[_material_number(name, key, each) for each in row.split("/")] for row in text.split(":")]
+    rows = [[_material_number(name, key, word) for word in row.split("/")] for row in text.split(":")]
     if {len(row) for row in rows} not in ({1}, {3}):
         raise ValueError(f"{key} of {name} must be numbers, or colors as .1/.2/.3, got {text!r}")
     value = [row[0] if len(row) == 1 else row for row in rows]
@@ -199,12 +199,14 @@ def told_apart(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     Raises:
         ValueError: A file is neither a mesh nor an environment.
     """
-    found = [(kind(path), path) for path in files]
-    for each, path in found:
-        if not each:
+    kinds = [(kind(path), path) for path in files]
+    for contents, path in kinds:
+        if not contents:
             known = ", ".join((*SUFFIXES, *LIGHTS))
             raise ValueError(f"files must be meshes and environments, which end in one of {known}; got {path}")
-    return [path for each, path in found if each == "mesh"], [path for each, path in found if each == "light"]
+    return [path for contents, path in kinds if contents == "mesh"], [
+        path for contents, path in kinds if contents == "light"
+    ]
 
 
 def scene(options: SimpleNamespace, *, playable: bool = False) -> Scene:
@@ -220,16 +222,16 @@ def scene(options: SimpleNamespace, *, playable: bool = False) -> Scene:
     paths, _ = told_apart(options.files)
     if not paths and options.ground:
         raise ValueError("--ground needs a mesh: the embedded scene has a board")
-    made = _loaded(paths, options, playable) if paths else embedded(brdf=options.brdf, playable=playable)
-    parts = list(made.parts)
+    result = _loaded(paths, options, playable) if paths else embedded(brdf=options.brdf, playable=playable)
+    parts = list(result.parts)
     for name, material in options.material:
         number = _number([part.name for part in parts], name)
         parts[number] = dataclasses.replace(parts[number], material=material)
-    made = dataclasses.replace(made, parts=parts)
+    result = dataclasses.replace(result, parts=parts)
     if not paths:  # The embedded scene has as many vertices as it needs.
-        return made
+        return result
     options_ = {"vertices": None, "environments": None, "folder": None, "progress": sys.stderr.isatty()}
-    return refinement.divided(made, options.refine, **options_)[0]
+    return refinement.divided(result, options.refine, **options_)[0]
 
 
 def embedded(*, brdf: Any = None, playable: bool = False) -> Scene:
@@ -261,21 +263,21 @@ def lights(options: SimpleNamespace, *, size: int = _SIZE) -> dict[str, Environm
         raise ValueError(f"--light-size must be a power of two, got {size}")
     if paths:
         names = unique([path.stem for path in paths])
-        found = {name: load_environment(path, size=size) for name, path in zip(names, paths, strict=True)}
+        environments = {name: load_environment(path, size=size) for name, path in zip(names, paths, strict=True)}
     else:
-        found = {"daylight": builtin.daylight(size=size), "studio": builtin.studio(size=size)}
+        environments = {"daylight": builtin.daylight(size=size), "studio": builtin.studio(size=size)}
     angles = options.turn
     if len(angles) == 1:
-        return {name: turned(light, angles[0]) for name, light in found.items()}
-    return {f"{name}_{angle:g}": turned(light, angle) for name, light in found.items() for angle in angles}
+        return {name: turned(light, angles[0]) for name, light in environments.items()}
+    return {f"{name}_{angle:g}": turned(light, angle) for name, light in environments.items() for angle in angles}
 
 
 def unique(names: Sequence[str]) -> list[str]:
     """Makes names unique by appending numbers."""
     result: list[str] = []
     for name in names:
-        every = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
-        result.append(next(each for each in every if each not in result))
+        candidates = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
+        result.append(next(candidate for candidate in candidates if candidate not in result))
     return result
 
 
@@ -307,11 +309,11 @@ def view(options: SimpleNamespace, *, size: int = _SIZE) -> View:
 def _loaded(paths: Sequence[Path], options: SimpleNamespace, playable: bool) -> Scene:
     """The scenes of all files as one upright scene, with a ground if requested."""
     turn = np.array(UPRIGHT[options.up])
-    every = [load_scene(path, outside=options.outside) for path in paths]
-    parts = [part for each in every for part in each.parts]
+    scenes = [load_scene(path, outside=options.outside) for path in paths]
+    parts = [part for loaded in scenes for part in loaded.parts]
     names = numbered([part.name for part in parts])
     if options.up != "y":
-        parts = [eqx.tree_at(lambda each: each.mesh, part, meshes.rotate(part.mesh, turn)) for part in parts]
+        parts = [eqx.tree_at(lambda p: p.mesh, part, meshes.rotate(part.mesh, turn)) for part in parts]
     if playable:
         parts = [_playable(part) for part in parts]
     if options.brdf is not None:  # vertex colors belong to the file's material
@@ -323,10 +325,10 @@ def _loaded(paths: Sequence[Path], options: SimpleNamespace, playable: bool) -> 
         parts.append(Part(name, meshes.ground_plane(Scene(parts).mesh), matte(0.5)))
     if options.up != "y":
         return Scene(parts)
-    lamps = [lamp for each in every for lamp in each.point_lights]
+    lamps = [lamp for loaded in scenes for lamp in loaded.point_lights]
     names = numbered([*(part.name for part in parts), *(lamp.name for lamp in lamps)])[len(parts) :]
     lamps = [dataclasses.replace(lamp, name=name) for name, lamp in zip(names, lamps, strict=True)]
-    return Scene(parts, every[0].cameras, point_lights=lamps)
+    return Scene(parts, scenes[0].cameras, point_lights=lamps)
 
 
 def _number(names: Sequence[str], name: str) -> int:
@@ -335,7 +337,7 @@ def _number(names: Sequence[str], name: str) -> int:
         return names.index(name)
     if name.isdecimal() and int(name) < len(names):
         return int(name)
-    known = ", ".join(f"{number} {each!r}" for number, each in enumerate(names))
+    known = ", ".join(f"{number} {label!r}" for number, label in enumerate(names))
     raise ValueError(f"--material must name one of the parts {known}, got {name!r}")
 
 

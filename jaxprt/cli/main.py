@@ -119,7 +119,7 @@ def run() -> None:
 
 def _end(status: Any) -> None:
     """Ends the process without waiting for threads of a viewer, which cannot be stopped in compiled code."""
-    if any(each.daemon and not isinstance(each, tqdm.TMonitor) for each in threading.enumerate()):
+    if any(thread.daemon and not isinstance(thread, tqdm.TMonitor) for thread in threading.enumerate()):
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         os._exit(status if isinstance(status, int) else 0 if status is None else 1)

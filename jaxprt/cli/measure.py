@@ -42,7 +42,7 @@ _VERTICES = 300
 )
 @options.folder("Folder that keeps precomputed data for later runs.")
 @options.as_json
-def command(**given: Any) -> None:
+def command(**arguments: Any) -> None:
     """Measure errors, times and bytes of a scene for each system, or of the fit of a BRDF.
 
     Errors are relative L2 errors of direct light against the exact sum, for pixels from three views and for vertices
@@ -55,10 +55,10 @@ def command(**given: Any) -> None:
       jaxprt measure --fit merl:gold-metallic-paint.binary grace.hdr
       jaxprt measure --fit ward:along=.1,across=.3 --system lobe
     """  # noqa: D301
-    chosen = SimpleNamespace(**given)
+    chosen = SimpleNamespace(**arguments)
     with options.telling(chosen.as_json):
-        found, text = _scene(chosen) if chosen.fit is None else _fit(chosen)
-    options.tell(found, text, as_json=chosen.as_json)
+        result, text = _scene(chosen) if chosen.fit is None else _fit(chosen)
+    options.tell(result, text, as_json=chosen.as_json)
 
 
 def _scene(chosen: SimpleNamespace) -> tuple[dict[str, Any], str]:
@@ -66,15 +66,15 @@ def _scene(chosen: SimpleNamespace) -> tuple[dict[str, Any], str]:
     scene, lights = inputs.scene(chosen), inputs.lights(chosen)
     systems = chosen.system or ("lobe",)
     options.check(chosen, systems, 6 * next(iter(lights.values())).radiance.shape[-2] ** 2)
-    made, texts = {}, []
+    reports, texts = {}, []
     for system in systems:
         recipes = {"planned": None} if system == "planned" else options.recipes(system, chosen)
         for name, recipe in recipes.items():
             ready = prepared(scene, lights, recipe, chosen, None if chosen.output is None else chosen.output / system)
-            found = ready.report(list(lights.values()))
-            made[name] = described(found, list(lights))
-            texts.append(f"{name}, in the light of {', '.join(lights)}:\n{found}")
-    return {"lights": list(lights), "systems": made}, "\n".join(texts)
+            summary = ready.report(list(lights.values()))
+            reports[name] = described(summary, list(lights))
+            texts.append(f"{name}, in the light of {', '.join(lights)}:\n{summary}")
+    return {"lights": list(lights), "systems": reports}, "\n".join(texts)
 
 
 def prepared(scene: Scene, lights: dict[str, Any], recipe: Any, chosen: SimpleNamespace, path: Any) -> RelitScene:
@@ -86,7 +86,7 @@ def prepared(scene: Scene, lights: dict[str, Any], recipe: Any, chosen: SimpleNa
     return precompute(scene, refine=False, **more)
 
 
-def described(found: Report, lights: list[str]) -> dict[str, Any]:
+def described(summary: Report, lights: list[str]) -> dict[str, Any]:
     """A report as JSON."""
 
     def errors(values: Any) -> dict[str, float]:
@@ -101,14 +101,14 @@ def described(found: Report, lights: list[str]) -> dict[str, Any]:
                 "vertex_error": errors(part.vertex_errors),
                 "bytes": int(part.nbytes),
             }
-            for part in found.part
+            for part in summary.part
         ],
-        "pixel_error": errors(found.errors),
-        "pixel_uncertainty": errors(found.uncertainty),
-        "interpolation_error": float(found.interpolation_error),
-        "light_seconds": float(found.light_seconds),
-        "view_seconds": float(found.view_seconds),
-        "bytes": int(found.nbytes),
+        "pixel_error": errors(summary.errors),
+        "pixel_uncertainty": errors(summary.uncertainty),
+        "interpolation_error": float(summary.interpolation_error),
+        "light_seconds": float(summary.light_seconds),
+        "view_seconds": float(summary.view_seconds),
+        "bytes": int(summary.nbytes),
     }
 
 
@@ -128,5 +128,5 @@ def _fit(chosen: SimpleNamespace) -> tuple[dict[str, Any], str]:
     vertex = report.sample(view, _VERTICES)
     right = report.exact_vertices(view, [vertex])[0]
     rows = [row for system in systems for row in report.table(system, view, vertex, right)]
-    found = {"material": inputs.describe(chosen.fit), "vertices": len(vertex), "rows": rows}
-    return found, "\n".join(map(report.row_text, rows))
+    result = {"material": inputs.describe(chosen.fit), "vertices": len(vertex), "rows": rows}
+    return result, "\n".join(map(report.row_text, rows))

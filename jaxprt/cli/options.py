@@ -53,8 +53,8 @@ def recipes(system: str, options: SimpleNamespace, *, lobes: int = _COUNT) -> di
     if system == "harmonic":
         return {system: Harmonics(options.order - 1, LAPLACIAN[options.window])}
     names = ("terms", "keep") if system == "separable" else ("terms", "keep", "components", "modes", "texels")
-    given = {name: value for name in names if (value := getattr(options, name)) is not None}
-    return {system: Terms(**given) if system == "separable" else Clusters(**given)}
+    values = {name: value for name in names if (value := getattr(options, name)) is not None}
+    return {system: Terms(**values) if system == "separable" else Clusters(**values)}
 
 
 class Command(click.Command):
@@ -63,10 +63,10 @@ class Command(click.Command):
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Writes a section for each group, in the order of the options."""
         groups: dict[str, list[tuple[str, str]]] = {}
-        for each in self.get_params(ctx):
-            record = each.get_help_record(ctx) if isinstance(each, click.Option) else None
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx) if isinstance(parameter, click.Option) else None
             if record is not None:
-                groups.setdefault(getattr(each, "group", "Options"), []).append(record)
+                groups.setdefault(getattr(parameter, "group", "Options"), []).append(record)
         for name, records in groups.items():
             with formatter.section(name):
                 formatter.write_dl(records)
@@ -150,27 +150,27 @@ def _required(
 class Several(click.ParamType):
     """Values separated by commas."""
 
-    def __init__(self, each: click.ParamType):
+    def __init__(self, item: click.ParamType):
         """Takes the type of each value."""
-        self.each, self.name = each, each.name
+        self.item, self.name = item, item.name
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
         """The name of the values in help and usage."""
-        choices = getattr(self.each, "choices", None)
+        choices = getattr(self.item, "choices", None)
         return f"[{'|'.join(choices)}],.." if choices else "N,.."
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple:
         """Parses the values and removes duplicates."""
         if isinstance(value, tuple):
             return value
-        return tuple(dict.fromkeys(self.each(each.strip(), param, ctx) for each in str(value).split(",")))
+        return tuple(dict.fromkeys(self.item(word.strip(), param, ctx) for word in str(value).split(",")))
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
         """Completes the last value."""
         before, comma, last = incomplete.rpartition(",")
         return [
-            CompletionItem(f"{before}{comma}{each.value}", each.type, each.help)
-            for each in self.each.shell_complete(ctx, param, last)
+            CompletionItem(f"{before}{comma}{completion.value}", completion.type, completion.help)
+            for completion in self.item.shell_complete(ctx, param, last)
         ]
 
 
@@ -233,10 +233,12 @@ class Material(click.ParamType):
         name, colon, rest = incomplete.partition(":")
         if not colon:
             names = dict.fromkeys([*inputs.MODELS, *inputs.FILES])
-            return [CompletionItem(f"{each}:") for each in names if each.startswith(name)]
+            return [CompletionItem(f"{known}:") for known in names if known.startswith(name)]
         before, comma, last = rest.rpartition(",")
         known = inputs.parameters(name) if name in inputs.MODELS else {}
-        return [CompletionItem(f"{name}:{before}{comma}{each}=") for each in known if each.startswith(last)]
+        return [
+            CompletionItem(f"{name}:{before}{comma}{parameter}=") for parameter in known if parameter.startswith(last)
+        ]
 
 
 class OfPart(Material):
@@ -275,8 +277,8 @@ def together(*decorators: Callable) -> Callable:
     """Combines several decorators. The first is outermost."""
 
     def decorate(function: Callable) -> Callable:
-        for each in reversed(decorators):
-            function = each(function)
+        for decorator in reversed(decorators):
+            function = decorator(function)
         return function
 
     return decorate
@@ -462,9 +464,9 @@ def tell(result: Any, text: str, *, as_json: bool) -> None:
 def finite(value: Any) -> Any:
     """A value that JSON can represent. Numbers that are not finite become null."""
     if isinstance(value, dict):
-        return {str(key): finite(each) for key, each in value.items()}
+        return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [finite(each) for each in value]
+        return [finite(item) for item in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, bool | int | str) else str(value)

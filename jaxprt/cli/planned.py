@@ -33,7 +33,7 @@ from jaxprt.relit.planning import ERROR, Plan, key_of, plan
 )
 @options.folder("Folder that keeps the plan, for `jaxprt relight --plan`, and the measurements.")
 @options.as_json
-def command(**given: Any) -> None:
+def command(**arguments: Any) -> None:
     """Choose the system and sizes that meet an error with the fewest bytes, for each part of a scene.
 
     The table has a row for each candidate: its error, time per frame, bytes, and precomputation time, measured on a
@@ -46,59 +46,59 @@ def command(**given: Any) -> None:
       jaxprt relight scene.glb grace.hdr --plan kept
       jaxprt plan bunny.ply --brdf ggx:roughness=.2 --json > plan.json
     """  # noqa: D301
-    chosen = SimpleNamespace(**given)
+    chosen = SimpleNamespace(**arguments)
     with options.telling(chosen.as_json):
-        found = _plan(chosen)
-    options.tell(described(found), str(found), as_json=chosen.as_json)
+        result = _plan(chosen)
+    options.tell(described(result), str(result), as_json=chosen.as_json)
 
 
 def _plan(chosen: SimpleNamespace) -> Plan:
     scene, lights = inputs.scene(chosen), list(inputs.lights(chosen).values())
-    kept = None
+    folder = None
     if chosen.output is not None:
         relight.make_folder(chosen.output)
-        kept = chosen.output / "plan"
-        if kept.exists():
-            found = relight.saved(chosen.output)
+        folder = chosen.output / "plan"
+        if folder.exists():
+            stored = relight.saved(chosen.output)
             asked = ERROR if chosen.error is None else chosen.error
-            if (found.key, found.asked, found.rate) == (key_of(scene, lights), asked, chosen.rate):
-                return found
-            raise ValueError(f"{kept} was made for another scene, lights, error or rate: name another --output")
+            if (stored.key, stored.asked, stored.rate) == (key_of(scene, lights), asked, chosen.rate):
+                return stored
+            raise ValueError(f"{folder} was made for another scene, lights, error or rate: name another --output")
     candidates = None if chosen.output is None else chosen.output / "candidates"
     options_ = {"error": chosen.error, "rate": chosen.rate, "path": candidates, "progress": sys.stderr.isatty()}
-    made = plan(scene, refine=False, environments=lights, **options_)
-    if kept is not None:
-        objects.save(kept, made)
-    return made
+    result = plan(scene, refine=False, environments=lights, **options_)
+    if folder is not None:
+        objects.save(folder, result)
+    return result
 
 
-def described(found: Plan) -> dict[str, Any]:
+def described(result: Plan) -> dict[str, Any]:
     """A plan as JSON."""
 
-    def candidate(each: Any) -> dict[str, Any]:
-        sizes = {"system": type(each.recipe).__name__, **vars(each.recipe)}
-        numbers = {"error": each.error, "seconds": each.seconds, "bytes": each.nbytes}
-        numbers["precompute_seconds"] = each.precompute_seconds
+    def candidate(option: Any) -> dict[str, Any]:
+        sizes = {"system": type(option.recipe).__name__, **vars(option.recipe)}
+        numbers = {"error": option.error, "seconds": option.seconds, "bytes": option.nbytes}
+        numbers["precompute_seconds"] = option.precompute_seconds
         return {"recipe": sizes, **{name: float(value) for name, value in numbers.items()}}
 
     return {
-        "asked": {"error": found.asked, "rate": found.rate, "light_size": found.size},
+        "asked": {"error": result.asked, "rate": result.rate, "light_size": result.size},
         "groups": [
             {
-                "parts": list(each.names),
-                "vertices": each.vertices,
-                "mesh_error": float(each.mesh_error),
-                "chosen": candidate(each.chosen),
-                "considered": [candidate(one) for one in each.considered],
+                "parts": list(group.names),
+                "vertices": group.vertices,
+                "mesh_error": float(group.mesh_error),
+                "chosen": candidate(group.chosen),
+                "considered": [candidate(one) for one in group.considered],
             }
-            for each in found.group
+            for group in result.group
         ],
         "reflected": {
             name: [float(share) for share in shares]
-            for name, shares in zip(found.names, found.reflected.T, strict=True)
+            for name, shares in zip(result.names, result.reflected.T, strict=True)
         },
-        "bounces": found.bounces,
-        "error": float(found.error),
-        "seconds": float(found.seconds),
-        "bytes": float(found.nbytes),
+        "bounces": result.bounces,
+        "error": float(result.error),
+        "seconds": float(result.seconds),
+        "bytes": float(result.nbytes),
     }

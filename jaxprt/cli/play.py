@@ -59,7 +59,7 @@ _PATIENCE = 0.5  # seconds; `jaxprt.cli.main.run` ends a process whose threads s
     default=True,
     help="Print the address without opening a browser.",
 )
-def command(**given: Any) -> None:
+def command(**arguments: Any) -> None:
     """Show a scene in the interactive viewer in a browser.
 
     FILEs are meshes, scenes and environments in any order. Without files there is an embedded scene with embedded
@@ -73,16 +73,16 @@ def command(**given: Any) -> None:
       jaxprt view bunny.ply --brdf metallic-roughness:base_color=.9/.6/.2,roughness=.3 --port 8080 --no-browser
       jaxprt view scene.glb --port 8765 --address http://localhost:9000
     """  # noqa: D301
-    check_port(given["port"])
-    check_address(given["address"])
-    if given["output"] is not None:
-        relight.make_folder(given["output"])
-    made, lights = ready(SimpleNamespace(**given))
-    server = _serve(made, lights, given["port"], given["address"])
-    way = "" if given["address"] is None else f" through port {server.port} of this machine"
+    check_port(arguments["port"])
+    check_address(arguments["address"])
+    if arguments["output"] is not None:
+        relight.make_folder(arguments["output"])
+    systems, lights = ready(SimpleNamespace(**arguments))
+    server = _serve(systems, lights, arguments["port"], arguments["address"])
+    way = "" if arguments["address"] is None else f" through port {server.port} of this machine"
     click.echo(f"jaxprt: {server.url} shows the scene{way}; Ctrl-C ends it")
     sys.stdout.flush()
-    if given["browser"] and given["address"] is None:  # a browser at another address is on another machine
+    if arguments["browser"] and arguments["address"] is None:  # a browser at another address is on another machine
         threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
     try:
         server.wait()
@@ -129,24 +129,26 @@ def _no_port(port: int, error: OSError) -> ValueError:
     return ValueError(f"--port must be free, got {port}: {reason}; without --port a free one is taken")
 
 
-def _serve(made: dict[str, RelitScene], lights: dict[str, Environment], port: int, address: str | None) -> Any:
+def _serve(systems: dict[str, RelitScene], lights: dict[str, Environment], port: int, address: str | None) -> Any:
     try:
-        return serve(made, environments=lights, port=port, address=address)
+        return serve(systems, environments=lights, port=port, address=address)
     except OSError as error:
         raise _no_port(port, error) from error
 
 
-def ready(given: SimpleNamespace) -> tuple[dict[str, RelitScene], dict[str, Environment]]:
+def ready(chosen: SimpleNamespace) -> tuple[dict[str, RelitScene], dict[str, Environment]]:
     """The scene of the options, precomputed by each system, and its lights."""
-    scene, lights = inputs.scene(given, playable=True), inputs.lights(given)
-    made = {}
-    for system in given.system:
-        recipes = options.recipes(system, given, lobes=LOBES)
+    scene, lights = inputs.scene(chosen, playable=True), inputs.lights(chosen)
+    systems = {}
+    for system in chosen.system:
+        recipes = options.recipes(system, chosen, lobes=LOBES)
         for recipe in recipes.values():
             shown = f"{recipe.lobes} lobes" if system == "lobe" else "harmonics"  # pyright: ignore
-            path = None if given.output is None else given.output / system  # shared by systems with any number of lobes
-            made[shown] = prepared(scene, lights, recipe, given.bounces, path)
-    return made, lights
+            path = (
+                None if chosen.output is None else chosen.output / system
+            )  # shared by systems with any number of lobes
+            systems[shown] = prepared(scene, lights, recipe, chosen.bounces, path)
+    return systems, lights
 
 
 def prepared(

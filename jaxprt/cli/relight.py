@@ -71,7 +71,7 @@ SYSTEMS = ("planned", *options.NAMES, "dynamic")
 @option("--part", group="Output", metavar="K/N", help="Only precompute the K-th of N parts into a shared --output.")
 @options.folder("Folder for pictures, report.json and precomputed data.", default="output")
 @options.as_json
-def command(**given: Any) -> None:
+def command(**arguments: Any) -> None:
     """Relight a scene under one or several lights, and measure the pictures.
 
     FILEs are meshes and scenes (GLB, glTF, OBJ, PLY, STL, OFF) and environments (EXR, HDR), in any order. The default
@@ -88,15 +88,15 @@ def command(**given: Any) -> None:
       jaxprt relight bunny.ply grace.hdr --ground --system dynamic --material 0=cook-torrance:roughness=.2 --animate 60
       jaxprt relight scene.glb --system lobe --output shared --part 3/16
     """  # noqa: D301
-    chosen = SimpleNamespace(**given)
+    chosen = SimpleNamespace(**arguments)
     with options.telling(chosen.as_json):
-        found = _run(chosen)
+        summary = _run(chosen)
     if chosen.part is None:
-        text = _text(found, chosen.output / "report.json")
+        text = _text(summary, chosen.output / "report.json")
     else:
         done = ["all parts are done: the same command without --part draws the pictures"]
-        text = "\n".join(found["unfinished"] or done)
-    options.tell(found, text, as_json=chosen.as_json)
+        text = "\n".join(summary["unfinished"] or done)
+    options.tell(summary, text, as_json=chosen.as_json)
 
 
 def _run(chosen: SimpleNamespace) -> dict[str, Any]:
@@ -108,50 +108,50 @@ def _run(chosen: SimpleNamespace) -> dict[str, Any]:
     make_folder(chosen.output)
     if part is not None:
         return {"unfinished": _share(view, chosen, systems, plan, part)}
-    found = _describe(view, chosen)
-    names = ", ".join(f"{each.name} {len(each.mesh.position)}" for each in view.scene.parts)
-    click.echo(f"jaxprt {found['machine']['jaxprt']}: {names} vertices")
-    made, changing = {}, None
+    summary = _describe(view, chosen)
+    names = ", ".join(f"{part.name} {len(part.mesh.position)}" for part in view.scene.parts)
+    click.echo(f"jaxprt {summary['machine']['jaxprt']}: {names} vertices")
+    candidates, changing = {}, None
     for system in systems:
         if system == "dynamic":
             count = 2 if chosen.bounces is None else chosen.bounces
             terms = chosen.terms or 4
             changing = animation.prepare(view, chosen.output, terms=terms, reflections=count)
-            made[system] = animation.made(changing, view)
+            candidates[system] = animation.made(changing, view)
         else:
-            made |= _made(system, view, chosen, plan)
-    found["precompute"] = {system: each.cost for system, each in made.items()}
-    _draw(found, view, made, chosen.output)
+            candidates |= _made(system, view, chosen, plan)
+    summary["precompute"] = {system: candidate.cost for system, candidate in candidates.items()}
+    _draw(summary, view, candidates, chosen.output)
     if changing is not None and chosen.animate:
         animation.animate(changing, view, chosen.output, frames=chosen.animate)
-    found["times"] = {system: report.times(view, each) for system, each in made.items()}
+    summary["times"] = {system: report.times(view, candidate) for system, candidate in candidates.items()}
     if chosen.table:
         vertex = report.sample(view, chosen.table)
         right = report.exact_vertices(view, [vertex])[0]
         tabled = [system for system in systems if system in report.TABLES]
-        found["table"] = [row for system in tabled for row in report.table(system, view, vertex, right)]
+        summary["table"] = [row for system in tabled for row in report.table(system, view, vertex, right)]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    found["peak_bytes"] = peak if sys.platform == "darwin" else 1024 * peak  # macOS reports bytes, Linux KiB
-    outputs.write(chosen.output / "report.json", json.dumps(options.finite(found), indent=2) + "\n")
-    return found
+    summary["peak_bytes"] = peak if sys.platform == "darwin" else 1024 * peak  # macOS reports bytes, Linux KiB
+    outputs.write(chosen.output / "report.json", json.dumps(options.finite(summary), indent=2) + "\n")
+    return summary
 
 
-def _draw(found: dict[str, Any], view: View, made: dict[str, Made], output: Path) -> None:
+def _draw(summary: dict[str, Any], view: View, candidates: dict[str, Made], output: Path) -> None:
     """Writes all pictures and adds their errors to the report."""
-    drawn = report.draw(view, made)
+    drawn = report.draw(view, candidates)
     truth = report.exact(view, drawn)
-    found["exact"] = {
+    summary["exact"] = {
         "seconds": truth.seconds,
         "pixels": len(truth.pixels.pixel),
         "picture_width": truth.picture.camera.width,
-        "vertices": {part.name: len(each) for part, each in zip(view.scene.parts, truth.vertex, strict=True)},
+        "vertices": {part.name: len(vertex) for part, vertex in zip(view.scene.parts, truth.vertex, strict=True)},
     }
-    found["lights"] = report.compare(view, made, drawn, truth, output)
-    stops = {name: light["exposure_stops"] for name, light in found["lights"].items()}
-    for system, each in made.items():
-        if each.system is not each.direct:
-            for name, fraction in report.reflect(view, system, each, stops, output).items():
-                found["lights"][name][system]["reflected_fraction"] = fraction
+    summary["lights"] = report.compare(view, candidates, drawn, truth, output)
+    stops = {name: light["exposure_stops"] for name, light in summary["lights"].items()}
+    for system, candidate in candidates.items():
+        if candidate.system is not candidate.direct:
+            for name, fraction in report.reflect(view, system, candidate, stops, output).items():
+                summary["lights"][name][system]["reflected_fraction"] = fraction
 
 
 def _systems(chosen: SimpleNamespace) -> tuple[str, ...]:
@@ -190,12 +190,12 @@ def saved(folder: Path) -> Plan:
     inside = folder / "plan"
     path = inside if inside.is_dir() else folder
     try:
-        found = report.objects.load(path)
+        plan = report.objects.load(path)
     except ValueError as error:
         raise ValueError(f"--plan must be a folder of `jaxprt plan`: {error}") from error
-    if not isinstance(found, Plan):
-        raise ValueError(f"--plan must be a folder of `jaxprt plan`, got a {type(found).__name__} in {path}")
-    return found
+    if not isinstance(plan, Plan):
+        raise ValueError(f"--plan must be a folder of `jaxprt plan`, got a {type(plan).__name__} in {path}")
+    return plan
 
 
 def make_folder(path: Path, *, name: str = "--output") -> None:
@@ -235,11 +235,11 @@ def _made(
         return {system: report.make(view, plan.recipes, output / system, bounces=bounces, **more)}
     if system == "planned":
         return {system: report.plan(view, output / system, error=chosen.error, bounces=chosen.bounces, **more)}
-    made = options.recipes(system, chosen)
+    recipes = options.recipes(system, chosen)
     # Data that does not depend on the number of lobes is shared in one folder.
     return {
         name: report.make(view, recipe, output / system, bounces=chosen.bounces, **more)
-        for name, recipe in made.items()
+        for name, recipe in recipes.items()
     }
 
 
@@ -271,13 +271,13 @@ def _describe(view: View, chosen: SimpleNamespace) -> dict[str, Any]:
     }
 
 
-def _text(found: dict[str, Any], path: Path) -> str:
+def _text(summary: dict[str, Any], path: Path) -> str:
     """The report as text."""
-    exact, rows = found["exact"], []
-    for name, light in found["lights"].items():
+    exact, rows = summary["exact"], []
+    for name, light in summary["lights"].items():
         least = light["exact_pixels_error"]
         rows.append(f"{name}: errors of pictures are measured by {exact['pixels']} exact pixels, {least:.1%} off")
-        for system in found["times"]:
+        for system in summary["times"]:
             parts = ", ".join(f"{part} {error:.1%}" for part, error in light[system]["vertex_error"].items())
             error, spread = (100 * light[system][key] for key in ("picture_error", "picture_error_spread"))
             rows.append(
@@ -286,10 +286,10 @@ def _text(found: dict[str, Any], path: Path) -> str:
             if "reflected_fraction" in light[system]:
                 fraction = light[system]["reflected_fraction"]
                 rows.append(f"{name}, {system}: {fraction:.1%} of the picture's light comes from other surfaces")
-    for system, times in found["times"].items():
+    for system, times in summary["times"].items():
         milliseconds = ", ".join(f"{name.removesuffix('_seconds')} {1e3 * x:.1f} ms" for name, x in times.items())
         rows.append(f"{system}: a picture after a {milliseconds.replace('_', ' ')}")
-    rows += map(report.row_text, found.get("table", []))
-    if exact["picture_width"] < found["camera"]["width"]:
+    rows += map(report.row_text, summary.get("table", []))
+    if exact["picture_width"] < summary["camera"]["width"]:
         rows.append(f"the exact picture and the differences are {exact['picture_width']} pixels wide")
     return "\n".join([*rows, f"pictures and {path.name} are in {path.parent}"])

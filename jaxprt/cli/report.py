@@ -96,9 +96,9 @@ class Made(NamedTuple):
         """Pictures under several lights, for direct light or with bounces."""
         system = self.system if reflected else self.direct
         if isinstance(system, relit.RelitScene) and camera.width * camera.height > _KEPT:
-            return [system.picture(each, camera) for each in lights]
+            return [system.picture(light, camera) for light in lights]
         seen = self.view(camera, reflected=reflected)
-        return [seen.picture(each) for each in lights]
+        return [seen.picture(light) for light in lights]
 
 
 class Truth(NamedTuple):
@@ -129,10 +129,10 @@ def plan(
             what to do.
     """
     lights = list(view.lights.values())
-    made = _made(view, output, error=error, environments=lights, bounces=bounces, executor=executor)
+    candidate = _made(view, output, error=error, environments=lights, bounces=bounces, executor=executor)
     for part in objects.load(output / "plan").part:
-        made.cost[part.name] = {"recipe": type(part.chosen.recipe).__name__, **vars(part.chosen.recipe)}
-    return made
+        candidate.cost[part.name] = {"recipe": type(part.chosen.recipe).__name__, **vars(part.chosen.recipe)}
+    return candidate
 
 
 def make(
@@ -150,27 +150,29 @@ def make(
             what to do.
     """
     size = next(iter(view.lights.values())).radiance.shape[-2]
-    made = _made(view, output, system=recipe, size=size, bounces=bounces, executor=executor)
+    candidate = _made(view, output, system=recipe, size=size, bounces=bounces, executor=executor)
     for part in view.scene.parts:
-        own = recipe[part.name] if isinstance(recipe, dict) else recipe
-        made.cost[part.name] = {"recipe": type(own).__name__, **vars(own)}
-    return made
+        chosen = recipe[part.name] if isinstance(recipe, dict) else recipe
+        candidate.cost[part.name] = {"recipe": type(chosen).__name__, **vars(chosen)}
+    return candidate
 
 
 def _made(view: View, output: Path, **options: Any) -> Made:
-    start, found = timeit.default_timer(), output.exists()
+    start, existed = timeit.default_timer(), output.exists()
     try:
         ready = relit.precompute(view.scene, refine=False, path=output, **options)
     except ValueError as error:
-        raise ValueError(f"{error}; on the command line, name another --output" if found else str(error)) from error
+        raise ValueError(f"{error}; on the command line, name another --output" if existed else str(error)) from error
     direct = ready.without_bounces()
     cost = {"seconds": timeit.default_timer() - start, "bytes": ready.nbytes}
     return Made(direct, direct if ready.bounces is None else ready, direct.mesh, None, cost)
 
 
-def draw(view: View, made: dict[str, Made]) -> dict[str, list[Array]]:
+def draw(view: View, reports: dict[str, Made]) -> dict[str, list[Array]]:
     """Pictures under direct light by each system, for all lights."""
-    return {system: each.pictures(list(view.lights.values()), view.camera) for system, each in made.items()}
+    return {
+        system: candidate.pictures(list(view.lights.values()), view.camera) for system, candidate in reports.items()
+    }
 
 
 def exact(view: View, drawn: dict[str, list[Array]]) -> Truth:
@@ -183,7 +185,7 @@ def exact(view: View, drawn: dict[str, list[Array]]) -> Truth:
     picture = exact_picture(view.scene, shadings, lights, view.camera, most=POINTS, progress=True)
     seconds["picture"], start = timeit.default_timer() - start, timeit.default_timer()
     random = np.random.default_rng(0)
-    vertex = [random.permutation(each)[:VERTICES] for each in seen(view)]
+    vertex = [random.permutation(vertices)[:VERTICES] for vertices in seen(view)]
     radiance = exact_vertices(view, vertex)
     seconds["vertices"] = timeit.default_timer() - start
     return Truth(pixels, picture, vertex, radiance, seconds)
@@ -201,7 +203,7 @@ def _importance(drawn: Iterable[Array]) -> np.ndarray:
 
 def exact_vertices(view: View, vertices: list[np.ndarray]) -> list[np.ndarray]:
     """Exact radiance of some vertices of the first parts, [light v c]."""
-    lights = Environment(jnp.stack([each.radiance for each in view.lights.values()]))
+    lights = Environment(jnp.stack([light.radiance for light in view.lights.values()]))
     options = {"eye": view.camera.eye, "occluder": view.scene.mesh, "progress": True}
     result, shadings = [], [of_part(part) for part in view.scene.parts]
     lamps = Lamps.of(centered(view.scene), shadings)
@@ -239,13 +241,13 @@ def _counts(scene: Scene) -> list[int]:
 
 
 def compare(
-    view: View, made: dict[str, Made], drawn: dict[str, list[Array]], truth: Truth, output: Path
+    view: View, candidates: dict[str, Made], drawn: dict[str, list[Array]], truth: Truth, output: Path
 ) -> dict[str, dict[str, Any]]:
     """Writes the pictures and returns each system's errors under each light.
 
     Args:
         view: The scene, its lights and the camera.
-        made: The systems.
+        candidates: The systems.
         drawn: The pictures by each system.
         truth: Exact radiance of the view.
         output: Folder for the pictures.
@@ -255,28 +257,28 @@ def compare(
     result: dict[str, dict[str, Any]] = {name: {} for name in view.lights}
     rows: dict[str, list[Array]] = {name: [] for name in view.lights}
     right = dict(zip(view.lights, map(jnp.asarray, truth.picture.color), strict=True))
-    stops = {name: image.automatic_exposure(each * surface) for name, each in right.items()}
-    for system, each in made.items():
-        alike = drawn[system] if camera.width == view.camera.width else each.pictures(lights, camera)
+    stops = {name: image.automatic_exposure(picture * surface) for name, picture in right.items()}
+    for system, candidate in candidates.items():
+        alike = drawn[system] if camera.width == view.camera.width else candidate.pictures(lights, camera)
         for number, (name, picture) in enumerate(zip(view.lights, drawn[system], strict=True)):
-            result[name][system] = _errors(view, name, each, picture, truth)
+            result[name][system] = _errors(view, name, candidate, picture, truth)
             _write(output, f"{name}_{system}", picture, stops[name], tone=view.tone)
             _write(
                 output, f"{name}_{system}_difference", jnp.abs(alike[number] - right[name]), stops[name], gain=_AMPLIFY
             )
             rows[name].append(picture)
-    for number, (name, each) in enumerate(right.items()):
+    for number, (name, truth_picture) in enumerate(right.items()):
         result[name]["exposure_stops"] = float(stops[name])
         result[name]["exact_pixels_error"] = float(truth.pixels.error[number])
-        _write(output, f"{name}_reference", each, stops[name], tone=view.tone)
-        row = jnp.concatenate([*rows[name], _enlarged(each, view.camera)], 1)
+        _write(output, f"{name}_reference", truth_picture, stops[name], tone=view.tone)
+        row = jnp.concatenate([*rows[name], _enlarged(truth_picture, view.camera)], 1)
         files.write_png(output / f"{name}.png", np.asarray(image.display(row, tone=view.tone, stops=stops[name])))
     return result
 
 
-def _errors(view: View, name: str, made: Made, picture: Array, truth: Truth) -> dict[str, Any]:
+def _errors(view: View, name: str, candidate: Made, picture: Array, truth: Truth) -> dict[str, Any]:
     """Relative L2 errors of a picture and of vertices, and the number of vertices with negative radiance."""
-    number, color = list(view.lights).index(name), made.color(view.lights[name], jnp.asarray(view.camera.eye))
+    number, color = list(view.lights).index(name), candidate.color(view.lights[name], jnp.asarray(view.camera.eye))
     parts = jnp.split(color, np.cumsum(_counts(view.scene))[:-1])
     rows = zip(view.scene.parts, parts, truth.vertex, truth.radiance, strict=True)
     error, spread = truth.pixels.relative_l2(picture, light=number)
@@ -290,10 +292,10 @@ def _errors(view: View, name: str, made: Made, picture: Array, truth: Truth) -> 
     }
 
 
-def reflect(view: View, system: str, made: Made, stops: dict[str, float], output: Path) -> dict[str, float]:
+def reflect(view: View, system: str, candidate: Made, stops: dict[str, float], output: Path) -> dict[str, float]:
     """Writes pictures that include interreflection. Returns its fraction of each picture's light."""
     lights, camera, pixels = list(view.lights.values()), view.camera, _points(view)
-    direct, whole = (made.pictures(lights, camera, reflected=each) for each in (False, True))
+    direct, whole = (candidate.pictures(lights, camera, reflected=bounces) for bounces in (False, True))
     result = {}
     for name, light, first, both in zip(view.lights, lights, direct, whole, strict=True):
         _write(output, f"{name}_{system}_bounces", both, jnp.asarray(stops[name], both.dtype), tone=view.tone)
@@ -314,19 +316,19 @@ def _write(output: Path, name: str, picture: Array, stops: Array, *, gain: float
     files.write_png(output / f"{name}.png", np.asarray(shown))
 
 
-def times(view: View, made: Made) -> dict[str, float]:
+def times(view: View, candidate: Made) -> dict[str, float]:
     """Median seconds per picture: with a new light from a cached view, and with a new view from the start."""
     light, camera = next(iter(view.lights.values())), view.camera
     edge = math.isqrt(_KEPT)
     camera = dataclasses.replace(camera, width=min(camera.width, edge), height=min(camera.height, edge))
-    kept, away, number = made.view(camera, reflected=True), camera.eye - camera.target, itertools.count(1)
+    still, away, number = candidate.view(camera, reflected=True), camera.eye - camera.target, itertools.count(1)
 
     def moved():
         return dataclasses.replace(camera, eye=camera.target + away * (1 + 0.01 * next(number)))
 
     return {
-        "light_change_seconds": _median(lambda: kept.picture(light)),
-        "view_change_seconds": _median(lambda: made.view(moved(), reflected=True).picture(light)),
+        "light_change_seconds": _median(lambda: still.picture(light)),
+        "view_change_seconds": _median(lambda: candidate.view(moved(), reflected=True).picture(light)),
     }
 
 
@@ -347,7 +349,7 @@ def table(name: str, view: View, vertex: np.ndarray, truth: np.ndarray) -> list[
     shading = of_part(view.scene.parts[0], takes=lambda table: False)
     size = next(iter(view.lights.values())).radiance.shape[-2]
     target = Target(view.scene.mesh, size=size, vertex=vertex, progress=False)
-    blend = None if shading.blend is None else jax.tree.map(lambda each: each[vertex], shading.blend)
+    blend = None if shading.blend is None else jax.tree.map(lambda leaf: leaf[vertex], shading.blend)
     rows = []
     for sizes, system in TABLES[name](shading, target):
         rows.append({"system": name, **sizes, **_row(system, blend, view, truth)})
@@ -369,8 +371,8 @@ def _row(system: System, blend: Blend | None, view: View, truth: np.ndarray) -> 
         "bytes_per_vertex": protocol.memory(system) / system.vertices,
         "light_change_nanoseconds_per_vertex": seconds / system.vertices * 1e9,
     }
-    for number, (name, each) in enumerate(view.lights.items()):
-        mine = protocol.radiance(system, each, eye=eye, materials=blend)
+    for number, (name, environment) in enumerate(view.lights.items()):
+        mine = protocol.radiance(system, environment, eye=eye, materials=blend)
         row[f"error {name}"] = float(image.relative_l2(mine, truth[number]))
     return row
 

@@ -80,14 +80,14 @@ def _file(scene: RelitScene, color: Float[np.ndarray, "v 3"], eye: list[float], 
     first = 0
     for part in scene.scene.parts:
         mesh: Mesh = part.mesh
-        own = color[first : first + len(mesh.position)]
-        first += len(own)
+        part_color = color[first : first + len(mesh.position)]
+        first += len(part_color)
         position = np.asarray(mesh.position, "<f4")
         span = {"min": position.min(0).tolist(), "max": position.max(0).tolist()}
         primitive = {
             "attributes": {
                 "POSITION": add(position, "VEC3", _FLOAT, _ARRAY, **span),
-                "COLOR_0": add(np.clip(own, 0, 1).astype("<f4"), "VEC3", _FLOAT, _ARRAY),
+                "COLOR_0": add(np.clip(part_color, 0, 1).astype("<f4"), "VEC3", _FLOAT, _ARRAY),
             },
             "indices": add(counterclockwise(mesh).reshape(-1), "SCALAR", _UINT, _ELEMENT),
             "material": 0,

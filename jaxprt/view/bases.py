@@ -30,9 +30,9 @@ def without_layers(scene: RelitScene) -> RelitScene:
     names = ", ".join(repr(part.name) for part, has in zip(old.parts, layered, strict=True) if has)
     warnings.warn(f"the page shows these parts without their clear coats and sheens: {names}", stacklevel=3)
     parts = [_bare(part) if has else part for part, has in zip(old.parts, layered, strict=True)]
-    shadings = [_base(each) if has else each for each, has in zip(scene.shading, layered, strict=True)]
+    shadings = [_base(shading) if has else shading for shading, has in zip(scene.shading, layered, strict=True)]
     systems = [scene.part_system(number) for number in range(len(parts))]
-    systems = [_alone(each) if has else each for each, has in zip(systems, layered, strict=True)]
+    systems = [_alone(system) if has else system for system, has in zip(systems, layered, strict=True)]
     counts, alone = [len(part.mesh.position) for part in parts], [[number] for number in range(len(parts))]
     place = Place.of(counts, alone, [False] * len(counts))
     return RelitScene(dataclasses.replace(old, parts=parts), shadings, place, systems)

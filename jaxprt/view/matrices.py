@@ -25,10 +25,10 @@ class CoarseMatrix(harmonic.TransferMatrix):
 
 def check(name: str, system: harmonic.HarmonicSystem) -> None:
     """Refuses parts that an exported page does not support."""
-    table, knots = system.brdf.table, [len(each) for each in system.brdf.knot]
+    table, knots = system.brdf.table, [len(knot) for knot in system.brdf.knot]
     if not system.brdf.isotropic:
         raise ValueError(f"part {name!r} must have an isotropic BRDF to be exported, got an anisotropic one")
-    if len(knots) > 1 or table.shape[1] > _CHANNELS or any(each > _KNOTS for each in knots):
+    if len(knots) > 1 or table.shape[1] > _CHANNELS or any(knot > _KNOTS for knot in knots):
         raise ValueError(
             f"part {name!r} must have a table of at most {_CHANNELS} channels and one parameter of {_KNOTS} knots to "
             f"be exported, got {table.shape[1]} and {knots}"
@@ -50,14 +50,14 @@ def visibility_of(name: str, system: harmonic.HarmonicSystem) -> Float[np.ndarra
     if isinstance(transport, CoarseMatrix):
         return np.asarray(transport.visible, np.float64)
     matrix = transport.matrix[:, 0]
-    found = to_visibility(matrix, transport.frame)
-    again = from_visibility(found, transport.frame, degree=system.degree)
+    visibility = to_visibility(matrix, transport.frame)
+    again = from_visibility(visibility, transport.frame, degree=system.degree)
     if not float(jnp.linalg.norm(again - matrix)) <= _EQUAL * float(jnp.linalg.norm(matrix)):
         raise ValueError(
             f"part {name!r} must have the transfer matrices of direct light to be exported, got others, as with "
             "interreflection"
         )
-    return np.asarray(found, np.float64)
+    return np.asarray(visibility, np.float64)
 
 
 def truncated(visible: Float[np.ndarray, "k v"], degree: int | None) -> Float[np.ndarray, "m v"]:
@@ -94,9 +94,9 @@ def plane_table(name: str, brdf: harmonic.HarmonicBrdf) -> Float[np.ndarray, "h 
     missed = 0.0
     for band in range(bands):
         rows = slice(band**2, (band + 1) ** 2)
-        found = np.einsum("jm,mchq->hqjc", np.linalg.pinv(basis[:, rows].T), value[rows])
-        missed += float(np.sum((np.einsum("jm,hqjc->mchq", basis[:, rows], found) - value[rows]) ** 2))
-        result[:, :, band, :, : value.shape[1]] = found
+        factor = np.einsum("jm,mchq->hqjc", np.linalg.pinv(basis[:, rows].T), value[rows])
+        missed += float(np.sum((np.einsum("jm,hqjc->mchq", basis[:, rows], factor) - value[rows]) ** 2))
+        result[:, :, band, :, : value.shape[1]] = factor
     if not np.sqrt(missed) <= _EQUAL * np.linalg.norm(value):
         raise ValueError(f"part {name!r} must have a BRDF that is symmetric about the plane of the view to be exported")
     return result.reshape(*value.shape[2:], bands**2, _CHANNELS)

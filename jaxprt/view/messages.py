@@ -158,14 +158,14 @@ def numbers(
     value = _items(message, name)
     if len(value) != count:
         raise ValueError(f"{name} must be {count} numbers, got {len(value)}")
-    return tuple(number({name: each}, name, low, high) for each in value)
+    return tuple(number({name: item}, name, low, high) for item in value)
 
 
 def pack(content: Mapping[str, Any], buffers: Sequence[bytes]) -> bytes:
     """Packs a message and its arrays into bytes: the length of the JSON, the JSON, and the arrays."""
-    head = json.dumps({"content": content, "lengths": [len(each) for each in buffers]}, allow_nan=False).encode()
+    head = json.dumps({"content": content, "lengths": [len(buffer) for buffer in buffers]}, allow_nan=False).encode()
     head += b" " * (-(len(head) + 4) % 8)  # arrays are aligned to eight bytes
-    return b"".join([struct.pack("<I", len(head)), head, *(each + bytes(-len(each) % 8) for each in buffers)])
+    return b"".join([struct.pack("<I", len(head)), head, *(buffer + bytes(-len(buffer) % 8) for buffer in buffers)])
 
 
 def unpack(data: bytes | bytearray) -> tuple[dict[str, Any], list[bytes]]:
@@ -281,6 +281,6 @@ def _material(part: str, message: Any) -> tuple[tuple[str, Any], ...]:
     result = []
     for name in sorted(message):
         count, most = MATERIAL[name]
-        found = numbers(message, name, count, low=0.0, high=most) if count > 1 else number(message, name, 0.0, most)
-        result.append((name, found))
+        entry = numbers(message, name, count, low=0.0, high=most) if count > 1 else number(message, name, 0.0, most)
+        result.append((name, entry))
     return tuple(result)

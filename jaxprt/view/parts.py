@@ -37,7 +37,7 @@ _SKY = 64  # most texels along the edge of a light's faces
 def content(reduced: RelitScene, level: int) -> tuple[dict[str, Any], list[bytes]]:
     """JSON description and arrays of all parts. `Piece` in the page's module defines their order."""
     systems, bits = systems_of(reduced), bits_of(reduced)
-    vectors, visible = [vectors_of(each) for each in systems], visibility_of(reduced)
+    vectors, visible = [vectors_of(exported) for exported in systems], visibility_of(reduced)
     unit, visible_unit = vector_unit(vectors), vector_unit(visible)
     terms = max(-(-len(unit) // 4) * 4, 4)
     place: dict[str, int] = dict.fromkeys(_STARTS, 0)
@@ -47,8 +47,8 @@ def content(reduced: RelitScene, level: int) -> tuple[dict[str, Any], list[bytes
     for number, (part, system, vector) in enumerate(zip(reduced.scene.parts, systems, vectors, strict=True)):
         shading, (start, table) = reduced.shading[number], tables.add(part.name, system)
         weight, seen, described = _weights(shading, system), _means(system, level), _described(part.material, shading)
-        own = None if bits is None else bits[number]
-        bit = np.zeros((0, 0), np.uint8) if own is None else own
+        words = None if bits is None else bits[number]
+        bit = np.zeros((0, 0), np.uint8) if words is None else words
         about = _about(system) | {"family": _family(shading), "texels": bool(bit.size)}
         about |= {"name": part.name, "count": vector.shape[1], "channels": weight.shape[1] - 1}
         about |= {"nodes": table.shape[1], "entries": table.shape[2], "terms": -(-len(vector) // 4) * 4}
@@ -58,22 +58,22 @@ def content(reduced: RelitScene, level: int) -> tuple[dict[str, Any], list[bytes
         stride = max(stride, seen.shape[1])
         rows = _bytes(vector, unit, terms), _bytes(visible[number], visible_unit, 4 * about["words"])
         first = int(reduced.place.first[number])
-        own = shading.mesh.normal if tilted is None else tilted[first : first + len(shading.mesh.normal)]
-        normal = np.round(32767 * np.asarray(own))
+        direction = shading.mesh.normal if tilted is None else tilted[first : first + len(shading.mesh.normal)]
+        normal = np.round(32767 * np.asarray(direction))
         kinds = "<i2", "i1", "u1", "<f4", "i1", "u1"
-        for kept, array, kind in zip(arrays, (normal, rows[0], seen, weight, rows[1], bit), kinds, strict=True):
-            kept.append(array.astype(kind).reshape(-1))
+        for column, array, kind in zip(arrays, (normal, rows[0], seen, weight, rows[1], bit), kinds, strict=True):
+            column.append(array.astype(kind).reshape(-1))
         pairs = len(vector.T) * -(-(about["bands"] ** 2) // 2)
         sizes = vector.shape[1], weight.size // 4, seen.size, rows[1].size // 4, pairs, bit.size
         place = {name: start + size for (name, start), size in zip(place.items(), sizes, strict=True)}
     content = {"parts": parts, "terms": terms, "vectorUnit": unit.tolist(), "stride": stride, **_scales(reduced, level)}
     content |= {"visibleUnit": visible_unit.tolist(), "arrived": place["arrivedStart"]}
-    edge = 0 if bits is None else math.isqrt(8 * next(each.shape[1] for each in bits if each is not None) // 6)
+    edge = 0 if bits is None else math.isqrt(8 * next(words.shape[1] for words in bits if words is not None) // 6)
     content |= {"texelEdge": edge, "texels": texels_of(edge) if edge else 0}
-    joined = [np.concatenate(each) for each in arrays]
+    joined = [np.concatenate(column) for column in arrays]
     joined.insert(3, tables.joined())
     joined[2] = np.append(joined[2], np.zeros(4 - len(joined[2]) % 4, np.uint8))  # whole words
-    return content, [each.tobytes() for each in joined]
+    return content, [array.tobytes() for array in joined]
 
 
 class _Tables:
@@ -112,8 +112,8 @@ def _about(system: Exported) -> dict[str, Any]:
     if isinstance(system, lobe.LobeSystem):
         return about | {"lobes": system.brdf.lobes, "steps": float(system.brdf.weight.shape[-1] - 1), **_knot(system)}
     if isinstance(system, harmonic.HarmonicSystem):
-        own = {"bands": system.degree + 1, "words": matrices.words(system), "laplacian": float(system.laplacian)}
-        return about | own | {"steps": system.brdf.steps, **_knot(system)}
+        fields = {"bands": system.degree + 1, "words": matrices.words(system), "laplacian": float(system.laplacian)}
+        return about | fields | {"steps": system.brdf.steps, **_knot(system)}
     return about
 
 
@@ -151,7 +151,7 @@ def blurring(size: int) -> dict[str, Any]:
     """Parameters for blurring the light to all lobe widths, as `jaxprt.systems.lobe.blurred_light.prefilter` does."""
     scale = blurred_light.scales(size)
     pairs = zip(scale.edge.tolist(), scale.spread.tolist(), strict=True)
-    source, own, concentration = zip(*(blurred_light.blur(*each, size=size) for each in pairs), strict=True)
+    source, variances, concentration = zip(*(blurred_light.blur(*pair, size=size) for pair in pairs), strict=True)
     return {
         "edges": scale.edge.tolist(),
         "spreads": scale.spread.tolist(),
@@ -159,7 +159,7 @@ def blurring(size: int) -> dict[str, Any]:
         "total": scale.total,
         "sources": source,
         "concentrations": concentration,
-        "reaches": [min(np.pi, blurred_light.REACH * np.sqrt(each)) for each in own],
+        "reaches": [min(np.pi, blurred_light.REACH * np.sqrt(variance)) for variance in variances],
     }
 
 
@@ -188,7 +188,7 @@ def _table(name: str, system: Exported) -> Float[np.ndarray, "h q e 4"]:
     if not isinstance(system, lobe.LobeSystem):
         return np.ones((1, 1, 1, 4))
     brdf = system.brdf
-    mean, scale, weight, albedo = (np.asarray(each) for each in (brdf.mean, brdf.scale, brdf.weight, brdf.diffuse))
+    mean, scale, weight, albedo = (np.asarray(array) for array in (brdf.mean, brdf.scale, brdf.weight, brdf.diffuse))
     if not brdf.knot:
         mean, scale, weight, albedo = mean[:, :, None], scale[:, None], weight[:, :, None], albedo[:, None]
     lobes, knots, nodes = scale.shape
@@ -216,7 +216,9 @@ def _weights(shading: Shading, system: Exported) -> Float[np.ndarray, "v k 4"]:
     if shading.blend is not None and shading.blend.parameter:
         result[:, 0, 3] = np.asarray(shading.blend.parameter[0])
     elif isinstance(shading.brdf, Channels):  # isotropic GGX with a constant roughness
-        result[:, 0, 3] = np.log(next(float(each.roughness[0]) for each in shading.brdf.model if isinstance(each, GGX)))
+        result[:, 0, 3] = np.log(
+            next(float(model.roughness[0]) for model in shading.brdf.model if isinstance(model, GGX))
+        )
     if shading.emitted is not None:
         result[:, -1, :3] = np.asarray(shading.emitted)
     return result
@@ -228,11 +230,11 @@ def _described(material: Any, shading: Shading) -> dict[str, Any] | None:
         values = {
             name: np.broadcast_to(np.asarray(getattr(material, name), float), 3) for name in ("diffuse", "specular")
         }
-        own = {name: each.tolist() for name, each in values.items()}
-        return {"material": own | {"exponent": float(material.exponent)}}
+        fields = {name: value.tolist() for name, value in values.items()}
+        return {"material": fields | {"exponent": float(material.exponent)}}
     if not isinstance(material, TexturedMaterial) or shading.scale is None:
         return None
-    if any(isinstance(each, Texture) for each in jax.tree.leaves(material, is_leaf=lambda x: isinstance(x, Texture))):
+    if any(isinstance(leaf, Texture) for leaf in jax.tree.leaves(material, is_leaf=lambda x: isinstance(x, Texture))):
         return None
     names = ("base_color", "metallic", "specular", "specular_color", "ior", "roughness")
     values = {name: np.asarray(getattr(material, name), float).tolist() for name in names}

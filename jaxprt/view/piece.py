@@ -113,21 +113,21 @@ def export(
     bare = without_layers(scene)
     bits = bits_of(bare)
     # Sharp shadows of a small sun matter more than finely averaged visibility.
-    fits = bits is not None and sum(each.size for each in bits if each is not None) <= _MOST_BITS
+    fits = bits is not None and sum(words.size for words in bits if words is not None) <= _MOST_BITS
     least = 0
     for texels, size in itertools.product([True, False] if fits else [False], _sizes(bare)):
         reduced = coarse(bare, size.level, texels=texels, degree=size.degree)
-        kept = parts.content(reduced, size.level)
-        least = len(_page(session, reduced, lights, kept, error=0.0, title=path.stem))
+        contents = parts.content(reduced, size.level)
+        least = len(_page(session, reduced, lights, contents, error=0.0, title=path.stem))
         if least > most + _SPARE:
             continue
-        error = max(_error(scene, reduced, each) for each in lights.values())
-        page = _page(session, reduced, lights, kept, error=error, title=path.stem)
+        error = max(_error(scene, reduced, light) for light in lights.values())
+        page = _page(session, reduced, lights, contents, error=error, title=path.stem)
         least = len(page)
         if least <= most:
             skies = _skies(session, most - least - _SPARE_OF_SKIES)
             if any(sky is not None for sky in skies):
-                page = _page(session, reduced, lights, kept, skies, error=error, title=path.stem)
+                page = _page(session, reduced, lights, contents, skies, error=error, title=path.stem)
                 least = len(page)
             outputs.write(path, page)
             return Piece(path, least, size.edge, texels, size.degree, error)
@@ -147,15 +147,15 @@ class _Size(NamedTuple):
 def _sizes(scene: RelitScene) -> list[_Size]:
     """Resolutions from the finest to the coarsest. The data that takes more bytes is reduced first."""
     systems, scale = systems_of(scene), scale_of(scene)
-    lobes = sum(each.vertices for each in systems if isinstance(each, lobe.LobeSystem))
-    matrix = [each for each in systems if isinstance(each, harmonic.HarmonicSystem)]
-    degree = max((each.degree for each in matrix), default=None)
+    lobes = sum(system.vertices for system in systems if isinstance(system, lobe.LobeSystem))
+    matrix = [system for system in systems if isinstance(system, harmonic.HarmonicSystem)]
+    degree = max((system.degree for system in matrix), default=None)
     level = 0 if scale is None else _FIRST
     result = []
     while True:
         result.append(_Size(level, 0 if scale is None else int(scale.edge[level]), degree))
         means = 0 if scale is None or level == len(scale.edge) - 1 else lobes * int(scale.total - scale.start[level])
-        bands = 0 if degree is None or degree <= 1 else sum(matrices.nbytes(each, degree) for each in matrix)
+        bands = 0 if degree is None or degree <= 1 else sum(matrices.nbytes(system, degree) for system in matrix)
         if not means and not bands:
             return result
         if means >= bands:
@@ -172,9 +172,9 @@ def _error(scene: RelitScene, reduced: RelitScene, light: Environment) -> float:
         turn = stages.about(2 * np.pi * number / _VIEWS)
         target = jnp.asarray(scene.camera.target)
         eye = target + turn @ (jnp.asarray(scene.camera.eye) - target)
-        full, found = (np.asarray(each.radiance(light, eye=eye)) for each in (scene, reduced))
-        full, found = np.broadcast_arrays(full, found)
-        off, whole = off + float(np.sum((found - full) ** 2)), whole + float(np.sum(full**2))
+        full, approximate = (np.asarray(variant.radiance(light, eye=eye)) for variant in (scene, reduced))
+        full, approximate = np.broadcast_arrays(full, approximate)
+        off, whole = off + float(np.sum((approximate - full) ** 2)), whole + float(np.sum(full**2))
     return float(np.sqrt(off / whole)) if whole else 0.0
 
 
@@ -182,7 +182,7 @@ def _page(
     session: Session,
     reduced: RelitScene,
     lights: Mapping[str, Environment],
-    kept: tuple[dict[str, Any], list[bytes]],
+    contents: tuple[dict[str, Any], list[bytes]],
     skies: Sequence[Reply | None] = (),
     *,
     error: float,
@@ -190,13 +190,13 @@ def _page(
 ) -> bytes:
     """The content of the HTML file."""
     reply = session.answer({"kind": "scene"})
-    content, arrays = kept
+    content, arrays = contents
     mips = parts.mips(next(iter(lights.values())).radiance.shape[-2])
     size = light_size(reduced)
     blurring = parts.blurring(size) if size else parts.NO_SCALES
     free = [
-        part | {"free": _free(part["free"]) if "material" in own else None}
-        for part, own in zip(reply.content["parts"], content["parts"], strict=True)
+        part | {"free": _free(part["free"]) if "material" in entry else None}
+        for part, entry in zip(reply.content["parts"], content["parts"], strict=True)
     ]
     head = reply.content | {
         "parts": free,
@@ -211,7 +211,7 @@ def _page(
         *reply.buffers,
         *arrays,
         *(cubemap.border_index(size=edge).astype("<u4").tobytes() for edge in rims),
-        *(_colored(each, mips[0]).astype("<f4").tobytes() for each in lights.values()),
+        *(_colored(light, mips[0]).astype("<f4").tobytes() for light in lights.values()),
         *(buffer for sky in skies if sky is not None for buffer in sky.buffers),
     ]
     data = base64.b64encode(zlib.compress(messages.pack(content, buffers), 6)).decode()
@@ -235,7 +235,7 @@ def _skies(session: Session, room: int | float) -> list[Reply | None]:
     shown = [light.panorama is not None for light in session.stages.lights]
     rows = _SKY_ROWS if any(shown) else 0
     while rows > _LEAST_SKY_ROWS:
-        skies = [session.sky(number, rows=rows) if own else None for number, own in enumerate(shown)]
+        skies = [session.sky(number, rows=rows) if flag else None for number, flag in enumerate(shown)]
         data = b"".join(bytes(buffer) for sky in skies if sky is not None for buffer in sky.buffers)
         if 4 / 3 * len(zlib.compress(data, 6)) <= room:
             return skies

@@ -89,33 +89,35 @@ def coarse(scene: RelitScene, level: int, *, texels: bool, degree: int | None = 
         texels: Whether the brightest texels of the light are summed one by one, on the parts that support it.
         degree: Highest degree of the transfer matrices; None keeps their degree.
     """
-    whole = [axes.mapped(each, lambda _, leaf: put(leaf)) for each in _systems(scene)]
-    systems = [_exported(part.name, each) for part, each in zip(scene.scene.parts, whole, strict=True)]
-    vectors = [vectors_of(each) for each in systems]
-    visible = [matrices.truncated(each, degree) for each in visibility_of(scene)]
+    whole = [axes.mapped(system, lambda _, leaf: put(leaf)) for system in _systems(scene)]
+    systems = [_exported(part.name, system) for part, system in zip(scene.scene.parts, whole, strict=True)]
+    vectors = [vectors_of(system) for system in systems]
+    visible = [matrices.truncated(matrix, degree) for matrix in visibility_of(scene)]
     unit, visible_unit = vector_unit(vectors), vector_unit(visible)
-    made: list[System] = []
+    coarse_systems: list[System] = []
     for system, vector, seen_in_part in zip(systems, vectors, visible, strict=True):
-        own = visible_unit[: len(seen_in_part), None]
+        part_unit = visible_unit[: len(seen_in_part), None]
         if isinstance(system, harmonic.HarmonicSystem):
-            made.append(matrices.reduced(system, np.round(seen_in_part / own) * own))
+            coarse_systems.append(matrices.reduced(system, np.round(seen_in_part / part_unit) * part_unit))
             continue
-        own = unit[: len(vector), None]
-        rounded = jnp.asarray(np.round(vector / own) * own, jnp.result_type(float))
+        step = unit[: len(vector), None]
+        rounded = jnp.asarray(np.round(vector / step) * step, jnp.result_type(float))
         if isinstance(system, harmonic.DiffuseSystem):
-            made.append(eqx.tree_at(lambda each: each.transport.vector, system, rounded[:, None]))
+            coarse_systems.append(eqx.tree_at(lambda s: s.transport.vector, system, rounded[:, None]))
             continue
         old = system.transport
         size, least = min(_LIGHT, old.size), float(pyramid.scales(old.size).spread[level])
         seen = CoarseTransport(old.pyramid, rounded, old.position, old.frame, size, old.size, least)
-        made.append(CoarseSystem(seen, system.brdf))
+        coarse_systems.append(CoarseSystem(seen, system.brdf))
     bits = bits_of(scene) if texels else None
     if bits is not None:
-        pairs = zip(made, whole, scene.shading, bits, strict=True)
-        made = [each if own is None else _with_texels(each, full, shading) for each, full, shading, own in pairs]
+        pairs = zip(coarse_systems, whole, scene.shading, bits, strict=True)
+        coarse_systems = [
+            system if words is None else _with_texels(system, full, shading) for system, full, shading, words in pairs
+        ]
     counts = [len(part.mesh.position) for part in scene.scene.parts]
     alone = [[number] for number in range(len(counts))]
-    return RelitScene(scene.scene, scene.shading, Place.of(counts, alone, [False] * len(counts)), made)
+    return RelitScene(scene.scene, scene.shading, Place.of(counts, alone, [False] * len(counts)), coarse_systems)
 
 
 def _systems(scene: RelitScene) -> list[System]:
@@ -139,9 +141,9 @@ def texels_of(size: int) -> int:
 
 def bits_of(scene: RelitScene) -> list[UInt8[np.ndarray, "v n"] | None] | None:
     """Visibility of single texels for each part, None for parts without; None if a lobe part or every part lacks it."""
-    result = [_bits(each) for each in _systems(scene)]
-    lobes = [isinstance(each, lobe.LobeSystem) for each in systems_of(scene)]
-    missing = [each is None for each in result]
+    result = [_bits(system) for system in _systems(scene)]
+    lobes = [isinstance(system, lobe.LobeSystem) for system in systems_of(scene)]
+    missing = [words is None for words in result]
     if all(missing) or any(np.logical_and(missing, lobes)):
         return None
     return result
@@ -168,50 +170,50 @@ def resized(light: Environment, *, size: int) -> Environment:
     large = light.radiance.shape[-2]
     area = jnp.asarray(cubemap.solid_angle(size=large))[..., None]
     folded = (6, size, large // size, size, large // size, -1)
-    value, whole = (each.reshape(folded).sum((2, 4)) for each in (light.radiance * area, area))
+    value, whole = (values.reshape(folded).sum((2, 4)) for values in (light.radiance * area, area))
     return Environment(value / whole)
 
 
 def systems_of(scene: RelitScene) -> list[Exported]:
     """The systems of the parts without single texels. Refuses systems that an exported page does not support."""
-    return [_exported(part.name, each) for part, each in zip(scene.scene.parts, _systems(scene), strict=True)]
+    return [_exported(part.name, system) for part, system in zip(scene.scene.parts, _systems(scene), strict=True)]
 
 
 def _exported(name: str, system: System) -> Exported:
-    own = system.system if isinstance(system, bright_texels.BrightTexels) else system
-    if isinstance(own, lobe.MatteSystem):
-        matte = own.transport
+    inner = system.system if isinstance(system, bright_texels.BrightTexels) else system
+    if isinstance(inner, lobe.MatteSystem):
+        matte = inner.transport
         vector = diffuse.harmonics_of(matte.vector, size=matte.size, degree=_DEGREE)
         transport = harmonic.TransferVector(vector[:, None], put(matte.position))
-        own = harmonic.DiffuseSystem(transport, put(own.albedo))
-    if not isinstance(own, Exported):
+        inner = harmonic.DiffuseSystem(transport, put(inner.albedo))
+    if not isinstance(inner, Exported):
         raise ValueError(
             f"part {name!r} must be ideally diffuse or made by the system 'lobe' or 'harmonic' to be exported, got "
-            f"{type(own).__name__}"
+            f"{type(inner).__name__}"
         )
-    if isinstance(own, harmonic.HarmonicSystem):
-        matrices.check(name, own)
-    if isinstance(own, lobe.LobeSystem):
-        _check(name, own.brdf)
-    return own
+    if isinstance(inner, harmonic.HarmonicSystem):
+        matrices.check(name, inner)
+    if isinstance(inner, lobe.LobeSystem):
+        _check(name, inner.brdf)
+    return inner
 
 
 def _check(name: str, brdf: lobe.LobeBrdf) -> None:
     if not brdf.isotropic:
         raise ValueError(f"part {name!r} must have an isotropic BRDF to be exported, got an anisotropic one")
-    if len(brdf.knot) > 1 or len(brdf.weight) > 4 or any(len(each) > _KNOTS for each in brdf.knot):
+    if len(brdf.knot) > 1 or len(brdf.weight) > 4 or any(len(knot) > _KNOTS for knot in brdf.knot):
         raise ValueError(
             f"part {name!r} must have a table of at most 4 channels and one parameter of {_KNOTS} knots to be "
-            f"exported, got {len(brdf.weight)} and {[len(each) for each in brdf.knot]}"
+            f"exported, got {len(brdf.weight)} and {[len(knot) for knot in brdf.knot]}"
         )
 
 
 def scale_of(scene: RelitScene) -> pyramid.Scales | None:
     """Scales of the visibility of the scene's glossy parts; None without glossy parts."""
-    found = [each.transport for each in systems_of(scene) if isinstance(each, lobe.LobeSystem)]
-    if not found:
+    transports = [system.transport for system in systems_of(scene) if isinstance(system, lobe.LobeSystem)]
+    if not transports:
         return None
-    return pyramid.scales(edge_of(found[0]))
+    return pyramid.scales(edge_of(transports[0]))
 
 
 def edge_of(transport: lobe.LobeTransport) -> int:
@@ -221,21 +223,23 @@ def edge_of(transport: lobe.LobeTransport) -> int:
 
 def light_size(scene: RelitScene) -> int:
     """Texels along a face's edge of the light in which a reduced scene looks up its lobes; 0 without lobes."""
-    return max((each.transport.size for each in systems_of(scene) if isinstance(each, lobe.LobeSystem)), default=0)
+    return max(
+        (system.transport.size for system in systems_of(scene) if isinstance(system, lobe.LobeSystem)), default=0
+    )
 
 
 def vectors_of(system: Exported) -> Float[np.ndarray, "lm v"]:
     """Transfer vectors of a part's vertices; empty for a part with transfer matrices."""
     if isinstance(system, harmonic.HarmonicSystem):
         return np.zeros((0, system.vertices))
-    found = system.transport.vector
+    vector = system.transport.vector
     if isinstance(system, lobe.LobeSystem) and not isinstance(system.transport, CoarseTransport):
-        found = diffuse.harmonics_of(found, size=system.transport.size, degree=_DEGREE)
+        vector = diffuse.harmonics_of(vector, size=system.transport.size, degree=_DEGREE)
     if isinstance(system, harmonic.DiffuseSystem):
-        if found.shape[1] != 1:
-            raise ValueError(f"transfer vectors must be gray to be exported, got {found.shape[1]} colors")
-        found = found[:, 0]
-    return np.asarray(found, np.float64)
+        if vector.shape[1] != 1:
+            raise ValueError(f"transfer vectors must be gray to be exported, got {vector.shape[1]} colors")
+        vector = vector[:, 0]
+    return np.asarray(vector, np.float64)
 
 
 def visibility_of(scene: RelitScene) -> list[Float[np.ndarray, "k v"]]:
@@ -251,6 +255,6 @@ def visibility_of(scene: RelitScene) -> list[Float[np.ndarray, "k v"]]:
 def vector_unit(vectors: list[np.ndarray]) -> Float[np.ndarray, " lm"]:
     """Quantization step of the signed bytes for each harmonic."""
     largest = np.zeros(max(map(len, vectors)))
-    for each in vectors:
-        largest[: len(each)] = np.maximum(largest[: len(each)], np.abs(each).max(1, initial=0))
+    for rows in vectors:
+        largest[: len(rows)] = np.maximum(largest[: len(rows)], np.abs(rows).max(1, initial=0))
     return np.maximum(largest, 1e-12) / 127

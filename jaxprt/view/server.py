@@ -189,9 +189,9 @@ class _Listener(http.server.ThreadingHTTPServer):
     def server_close(self) -> None:
         """Closes open connections too."""
         super().server_close()
-        for each in list(self._open):
+        for connection in list(self._open):
             with contextlib.suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
+                connection.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Prints nothing: errors come from tabs that were closed before their answer."""

@@ -69,19 +69,19 @@ class Session:
         if environments is not None and not isinstance(environments, Mapping):
             got = require.shown(environments)
             raise TypeError(f"environments must be a dictionary from names to lights, got {got}")
-        every = {"system": systems} if isinstance(systems, RelitScene) else dict(systems)
-        if not every:
+        by_name = {"system": systems} if isinstance(systems, RelitScene) else dict(systems)
+        if not by_name:
             raise ValueError("a viewer must have a system, got none")
-        for name, each in every.items():
-            require.kind(f"the system {name!r}", each, RelitScene, source="jaxprt.precompute")
-        scene = next(iter(every.values()))
+        for name, system in by_name.items():
+            require.kind(f"the system {name!r}", system, RelitScene, source="jaxprt.precompute")
+        scene = next(iter(by_name.values()))
         shape = [(part.name, part.mesh.position.shape) for part in scene.scene.parts]
-        for name, each in every.items():
-            if [(part.name, part.mesh.position.shape) for part in each.scene.parts] != shape:
+        for name, system in by_name.items():
+            if [(part.name, part.mesh.position.shape) for part in system.scene.parts] != shape:
                 raise ValueError(f"systems must be of the same scene, got another scene for {name!r}")
         lights = _named(lights_of(scene.scene)) if environments is None else dict(environments)
         _check_lights(lights)
-        self.stages = Stages(every, lights)
+        self.stages = Stages(by_name, lights)
         self._lock = threading.Lock()
         self._newest: OrderedDict[str, int] = OrderedDict()  # sequence number of the newest look of each viewer
         self._ended = False
@@ -146,7 +146,7 @@ class Session:
             "kind": "scene",
             "parts": parts,
             "lights": self.stages.name,
-            "systems": {name: {"bounces": each.bounces is not None} for name, each in self.stages.systems.items()},
+            "systems": {name: {"bounces": system.bounces is not None} for name, system in self.stages.systems.items()},
             "rests": ["still", "exact"],
             "vertices": len(mesh.position),
             "triangles": len(mesh.face),
@@ -160,7 +160,7 @@ class Session:
         # Those with black backs come first: of the others the viewer draws no backs.
         content["backs"] = int(np.count_nonzero(~hidden))
         arrays = np.asarray(mesh.position, "<f4"), face[np.argsort(hidden, kind="stable")]
-        return Reply(content, [each.tobytes() for each in arrays])
+        return Reply(content, [array.tobytes() for array in arrays])
 
     def _parse(self, message: Mapping[str, Any]) -> tuple[Look, int]:
         look = messages.look(message, systems=list(self.stages.systems), lights=len(self.stages.lights))
@@ -184,7 +184,7 @@ class Session:
         )
         done = time.perf_counter()
         spent = {"light": lit - began, "view": viewed - lit, "combine": done - viewed}
-        times = {name: 1000 * each for name, each in spent.items()}
+        times = {name: 1000 * seconds for name, seconds in spent.items()}
         content = {"kind": "color", "seq": seq, "scale": scale, "ms": times}
         return Reply(content, [data] if which is None else [data, np.packbits(which).tobytes()])
 
@@ -216,13 +216,13 @@ class Session:
         between = self._between(message, seq)
         between()
         scene, camera = self.stages.changed_scene(look), stages.camera(look, width, height)
-        given = scene, [of_part(part) for part in scene.parts], [self.stages.environment(look)], camera
+        arguments = scene, [of_part(part) for part in scene.parts], [self.stages.environment(look)], camera
         told = {}
         if not coarse:
-            pixels = exact.exact_pixels(*given, pixels=_PIXELS, between=between)
+            pixels = exact.exact_pixels(*arguments, pixels=_PIXELS, between=between)
             error, spread = pixels.relative_l2(self.stages.direct_picture(look, width, height, between=between))
             told = {"error": error, "spread": spread} if np.isfinite([error, spread]).all() else {}
-        truth = exact.exact_picture(*given, between=between)
+        truth = exact.exact_picture(*arguments, between=between)
         data, scale = messages.encode(truth.color[0], stops=_stops(message), tone=_tone(message))
         size = {"width": truth.camera.width, "height": truth.camera.height}
         return Reply({"kind": "still", "seq": seq, "scale": scale, "exact": True, **told, **size}, [data])
@@ -277,14 +277,14 @@ def _viewer(message: Mapping[str, Any]) -> str:
 
 def _size(message: Mapping[str, Any]) -> tuple[int, int, bool]:
     """Width and height of the picture that a message requests, and whether it is a coarse one, which is smaller."""
-    width, height = (int(messages.number(message, each, 1.0, _LARGEST)) for each in ("width", "height"))
+    width, height = (int(messages.number(message, key, 1.0, _LARGEST)) for key in ("width", "height"))
     coarse = messages.truth(message, "coarse")
     step = _COARSE[message["kind"]] if coarse else 1
     return max(width // step, 1), max(height // step, 1), coarse
 
 
 def _named(lights: Sequence[Environment]) -> dict[str, Environment]:
-    return {f"light {number}": each for number, each in enumerate(lights, 1)}
+    return {f"light {number}": light for number, light in enumerate(lights, 1)}
 
 
 def _stops(message: Mapping[str, Any]) -> float | None:
@@ -301,11 +301,11 @@ def _tone(message: Mapping[str, Any]) -> str:
 def _check_lights(lights: Mapping[str, Environment]) -> None:
     if not lights:
         raise ValueError("a viewer must have a light, got none")
-    for name, each in lights.items():
-        require.kind(f"the light {name!r}", each, Environment, source="jaxprt.load_environment")
-        require.colors(f"the light {name!r}", each.radiance)
-        if each.radiance.ndim != 4:
-            raise ValueError(f"the light {name!r} must be one light, [6, n, n, c], got {list(each.radiance.shape)}")
-    sizes = {each.radiance.shape[-2] for each in lights.values()}
+    for name, light in lights.items():
+        require.kind(f"the light {name!r}", light, Environment, source="jaxprt.load_environment")
+        require.colors(f"the light {name!r}", light.radiance)
+        if light.radiance.ndim != 4:
+            raise ValueError(f"the light {name!r} must be one light, [6, n, n, c], got {list(light.radiance.shape)}")
+    sizes = {light.radiance.shape[-2] for light in lights.values()}
     if len(sizes) > 1:
         raise ValueError(f"lights must be of one size, got faces of {', '.join(map(str, sorted(sizes)))} texels")

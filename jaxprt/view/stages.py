@@ -41,7 +41,7 @@ class Stages:
         systems = {name: scene.centered() for name, scene in systems.items()}
         self.systems = systems
         self.name, self.lights = list(environments), list(environments.values())
-        self._bare = {name: scene.without_bounces() for name, scene in systems.items()}
+        self._bare = {name: system.without_bounces() for name, system in systems.items()}
         self._kept: dict[str, OrderedDict[Hashable, Any]] = {}
         self._lock = threading.Lock()
 
@@ -147,16 +147,16 @@ class Stages:
         self, look: Look, width: int, height: int, *, samples: int = 4, between: Between = None
     ) -> Float[np.ndarray, "h w 3"]:
         """The picture with shading at pixels. `RelitScene.picture` explains the options."""
-        given = self.environment(look), camera(look, width, height)
+        arguments = self.environment(look), camera(look, width, height)
         options = {"samples": samples, "between": between}
-        found = self.system(look).picture(*given, materials=self.materials(look), **options)
-        return np.broadcast_to(np.asarray(found), (height, width, 3))
+        color = self.system(look).picture(*arguments, materials=self.materials(look), **options)
+        return np.broadcast_to(np.asarray(color), (height, width, 3))
 
     def direct_picture(self, look: Look, width: int, height: int, *, between: Between) -> Float[np.ndarray, "h w 3"]:
         """The picture under direct light of the environment only."""
-        given = self.environment(look), camera(look, width, height)
-        found = self._bare[look.system].picture(*given, materials=self.materials(look), between=between)
-        return np.broadcast_to(np.asarray(found), (height, width, 3))
+        arguments = self.environment(look), camera(look, width, height)
+        color = self._bare[look.system].picture(*arguments, materials=self.materials(look), between=between)
+        return np.broadcast_to(np.asarray(color), (height, width, 3))
 
     def changed_scene(self, look: Look) -> Scene:
         """The scene with the changed materials."""
@@ -167,16 +167,16 @@ class Stages:
     def _once(self, stage: str, key: Hashable, make: Callable[[], Made]) -> Made:
         """The cached result for a key, computed now if it is missing."""
         with self._lock:
-            kept = self._kept.setdefault(stage, OrderedDict())
-            if key in kept:
-                kept.move_to_end(key)
-                return kept[key]
-        made = jax.block_until_ready(make())
+            results = self._kept.setdefault(stage, OrderedDict())
+            if key in results:
+                results.move_to_end(key)
+                return results[key]
+        result = jax.block_until_ready(make())
         with self._lock:
-            kept[key] = made
-            while len(kept) > _KEPT:
-                kept.popitem(last=False)
-        return made
+            results[key] = result
+            while len(results) > _KEPT:
+                results.popitem(last=False)
+        return result
 
 
 def counterclockwise(mesh: Mesh) -> UInt32[np.ndarray, "f 3"]:
@@ -242,7 +242,7 @@ def changed(material: Any, name: str, values: Mapping[str, Any]) -> TexturedMate
         ValueError: The material is a BRDF, which cannot change.
     """
     if isinstance(material, BlinnPhong):
-        new = {each: jnp.asarray(values[each]) for each in ("diffuse", "exponent") if each in values}
+        new = {key: jnp.asarray(values[key]) for key in ("diffuse", "exponent") if key in values}
         if "f0" in values or "specular" in values:
             new["specular"] = _tinted(material.specular, 1.0, values)
         return dataclasses.replace(material, **new)

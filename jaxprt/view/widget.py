@@ -48,8 +48,8 @@ class Viewer(anywidget.AnyWidget):
 
     def close(self) -> None:
         """Removes the viewer from the notebook."""
-        for each in (self._looks, self._rests):
-            each.shutdown(wait=False, cancel_futures=True)
+        for executor in (self._looks, self._rests):
+            executor.shutdown(wait=False, cancel_futures=True)
         super().close()
 
     def __repr__(self) -> str:
@@ -65,16 +65,16 @@ class Viewer(anywidget.AnyWidget):
         words = repr(self)
         page = f'<img class="jaxprt-picture" alt="{html.escape(words)}" src="data:image/png;base64,{picture}">{_STYLE}'
         display({"text/html": page, "image/png": picture, "text/plain": words}, raw=True)
-        found = super()._repr_mimebundle_(**options)
-        if found is not None:
-            data, more = found
+        bundle = super()._repr_mimebundle_(**options)
+        if bundle is not None:
+            data, more = bundle
             data.pop("text/plain")  # pages would show it below the picture
             display(data, metadata=more, raw=True)
 
     def _heard(self, widget: Any, message: Any, buffers: Sequence[Any]) -> None:
         if isinstance(message, dict) and isinstance(message.get("content"), dict):
             threads = self._rests if message["content"].get("kind") in ("still", "exact") else self._looks
-            threads.submit(self._answer, message, [bytes(each) for each in buffers])
+            threads.submit(self._answer, message, [bytes(buffer) for buffer in buffers])
 
     def _answer(self, message: dict[str, Any], buffers: list[bytes]) -> None:
         content, arrays = self.session.answer(message["content"], buffers)
