@@ -26,7 +26,7 @@ import numpy as np
 import jaxprt as prt
 from benchmarks import harness
 from jaxprt import image, view
-from jaxprt.cli.inputs import embedded
+from jaxprt.cli.inputs import example_scene
 from jaxprt.scene import TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
 from jaxprt.view import messages
@@ -77,7 +77,7 @@ def hands(bounces: int, *, quick: bool) -> Iterator[dict[str, Any]]:
     size, repeats = (8, 3) if quick else (64, 15)
     recipe = prt.relit.Lobes(8, texels=2) if quick else prt.relit.Lobes(8)
     made = prt.precompute(
-        embedded(playable=True), refine=False, system=recipe, bounces=bounces, size=size, progress=False
+        example_scene(playable=True), refine=False, system=recipe, bounces=bounces, size=size, progress=False
     )
     lights = {"daylight": builtin.daylight(size=size), "studio": builtin.studio(size=size)}
     server = view.serve(made, environments=lights)

@@ -77,7 +77,7 @@ def kept(function: Callable, *, static: tuple[str, ...] = ()) -> Any:
             arrays. Static options are passed by name.
         static: Names of the static options.
     """
-    return executables.Kept(function, jit(function, static_argnames=static), static)
+    return executables.StoredFunction(function, jit(function, static_argnames=static), static)
 
 
 def _exact(function: Callable) -> Callable:

@@ -267,7 +267,7 @@ def test_a_processor_whose_programs_xla_complains_about_keeps_none(noisy, monkey
         os.write(2, b"doesn't match the machine type for execution" if noisy else b"of another thread")
 
     monkeypatch.setattr(jax_cache.serialize_executable, "deserialize_and_load", load)
-    monkeypatch.setattr(jax_cache, "kept", lambda: files)
+    monkeypatch.setattr(jax_cache, "process_store", lambda: files)
     asked = inspect.unwrap(jax_cache.loads_quietly)
     assert asked() is asked() is not noisy  # the second time from a file
     assert capfd.readouterr().err == ("" if noisy else "of another thread")
@@ -281,7 +281,7 @@ def kept_files(monkeypatch, files):
     monkeypatch.setattr(compilation_cache, "_cache_initialized", True)
     monkeypatch.setattr(jax_cache, "active", lambda: True)
     monkeypatch.setattr(jax_cache, "loads_quietly", lambda: True)
-    monkeypatch.setattr(jax_cache, "kept", lambda: files)
+    monkeypatch.setattr(jax_cache, "process_store", lambda: files)
     return files
 
 
@@ -386,8 +386,8 @@ def test_threads_compile_an_executable_once(kept_files):
 
 def test_surroundings_change_with_versions_flags_options_processor_and_code(monkeypatch, tmp_path):
     found = {executables.surroundings()}
-    fixed = inspect.unwrap(executables._fixed)
-    monkeypatch.setattr(executables, "_fixed", fixed)
+    fixed = inspect.unwrap(executables._process_facts)
+    monkeypatch.setattr(executables, "_process_facts", fixed)
     for change in (
         lambda: monkeypatch.setattr(executables, "version_str", "0.0.1"),
         lambda: monkeypatch.setattr(executables, "processor", lambda: "another"),
@@ -413,11 +413,11 @@ def test_surroundings_change_with_versions_flags_options_processor_and_code(monk
 @pytest.mark.parametrize("value", [lambda: 0, object(), np.ones(2), np.float32(1), {"a": object()}, called_back])
 def test_values_that_have_no_name_are_refused(value):
     with pytest.raises(executables.UnnamedError):
-        executables.described(value)
+        executables.describe(value)
 
 
 def test_names_tell_values_apart():
     values = [None, 0, 0.0, False, "0", (0,), [0], {"a": 0}, {"b": 0}, np.dtype("f4"), np.dtype("f8"), Camera, axes]
-    assert len({executables.described(each) for each in values}) == len(values)
+    assert len({executables.describe(each) for each in values}) == len(values)
     structures = [jax.tree.structure(each) for each in (camera(), camera(width=5), (1,), [1], {"a": 1}, None)]
-    assert len({executables.described(each) for each in structures}) == len(structures)
+    assert len({executables.describe(each) for each in structures}) == len(structures)

@@ -80,7 +80,7 @@ def command(**arguments: Any) -> None:
     """  # noqa: D301
     chosen = SimpleNamespace(**arguments)
     _check(chosen)
-    with options.telling(chosen.as_json):
+    with options.reserve_stdout(chosen.as_json):
         files = _write(chosen)
     rows = [f"jaxprt: {row['path']}, {row['bytes']:,} bytes{row.pop('words')}" for row in files]
     options.tell(files, "\n".join(rows), as_json=chosen.as_json)
@@ -128,7 +128,7 @@ def _write(chosen: SimpleNamespace) -> list[dict[str, Any]]:
         if ready is None:
             (recipe,) = options.recipes(chosen.system[0], chosen, lobes=play.LOBES).values()
             scene = inputs.scene(chosen, playable=True)
-            ready = play.prepared(scene, lights, recipe, chosen.bounces, chosen.store)
+            ready = play.precompute_scene(scene, lights, recipe, chosen.bounces, chosen.store)
         if kind == "page":
             piece = export(ready, path, environments=lights, most=chosen.most)
             row = {"error": piece.error, "visibility_edge": piece.edge, "degree": piece.degree}

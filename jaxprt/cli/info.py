@@ -63,16 +63,16 @@ def command(**arguments: Any) -> None:
     chosen = SimpleNamespace(**arguments)
     if not chosen.files:
         here = installation()
-        options.tell(here, _installed(here), as_json=chosen.as_json)
+        options.tell(here, _versions(here), as_json=chosen.as_json)
         if here["wrong_sums"]:
             raise ValueError(_WRONG)
         return
     facts, refused = [], []
     for path in chosen.files:
         try:
-            facts.append(about(path, chosen.light_size, outside=chosen.outside))
+            facts.append(describe_path(path, chosen.light_size, outside=chosen.outside))
         except (ValueError, OSError) as error:
-            refused.append(options.said(error))
+            refused.append(options.message_of(error))
     options.tell(facts, "\n".join(map(_text, facts)), as_json=chosen.as_json)
     if refused:
         raise ValueError("\n".join(refused))
@@ -92,14 +92,14 @@ def installation() -> dict[str, Any]:
     }
 
 
-def _installed(here: dict[str, Any]) -> str:
+def _versions(here: dict[str, Any]) -> str:
     names = ("jaxprt", "jax", "jaxlib", "numpy", "embreex")
     versions = ", ".join(f"{name} {here[name]}" for name in names)
     sums = f"{here['wrong_sums']} wrong sums" if here["wrong_sums"] else "right"
     return f"{versions}, Python {here['python']}\ndevice {here['platform']}, {here['device']}\ncompiler {sums}"
 
 
-def about(path: Path, light_size: int, *, outside: bool) -> dict[str, Any]:
+def describe_path(path: Path, light_size: int, *, outside: bool) -> dict[str, Any]:
     """Describes the content of a file or folder, as JSON.
 
     Raises:
@@ -107,13 +107,13 @@ def about(path: Path, light_size: int, *, outside: bool) -> dict[str, Any]:
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        description = {"path": str(path), **_about(path, light_size, outside)}
+        description = {"path": str(path), **_describe_file(path, light_size, outside)}
     if caught:
         description["left_out"] = [str(warning.message) for warning in caught]
     return description
 
 
-def _about(path: Path, light_size: int, outside: bool) -> dict[str, Any]:
+def _describe_file(path: Path, light_size: int, outside: bool) -> dict[str, Any]:
     if path.is_dir():
         return _folder(path)
     kind = inputs.kind(path)
@@ -181,7 +181,7 @@ def _brdf(path: Path) -> dict[str, Any]:
     if path.suffix.lower() == ".bin" and path.with_name("merl_npf_materials.txt").exists():
         names = path.with_name("merl_npf_materials.txt").read_text(encoding="utf-8").split()
         brdf.load_npf(path, names[0])
-        return _named("npf", path, names)
+        return _brdf_facts("npf", path, names)
     text = start.decode("utf-8", errors="replace")
     if path.suffix.lower() == ".json":
         known = regular.json_object(path, "a file of Lafortune BRDFs").get("materials")
@@ -189,11 +189,11 @@ def _brdf(path: Path) -> dict[str, Any]:
             raise ValueError(f"{path} must be JSON with materials, got none")
         names = list(known)
         brdf.load_lafortune(path, names[0])
-        return _named("lafortune", path, names)
+        return _brdf_facts("lafortune", path, names)
     if "Aggregate(Lambertian(" in text:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
         names = [match[1] for match in (re.match(r"([\w-]+) *= *Aggregate", line) for line in lines) if match]
-        facts = _named("ngan", path, names)
+        facts = _brdf_facts("ngan", path, names)
         return {**facts, "model": type(brdf.load_ngan(path, names[0])).__name__}
     if path.suffix.lower() == ".brdf":
         samples = len(brdf.scattered.read_scattered(path)[0])
@@ -205,7 +205,7 @@ def _brdf(path: Path) -> dict[str, Any]:
     )
 
 
-def _named(form: str, path: Path, names: list[str]) -> dict[str, Any]:
+def _brdf_facts(form: str, path: Path, names: list[str]) -> dict[str, Any]:
     return {"kind": "brdf", "form": form, "materials": names, "use": f"{form}:{path},material={names[0]}"}
 
 
@@ -214,7 +214,7 @@ def _folder(path: Path) -> dict[str, Any]:
     nbytes = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
     if (path / "object.json").exists() or (path / "store.json").exists():
         try:
-            return _written(path, nbytes)
+            return _describe_store(path, nbytes)
         except Exception as error:
             raise ValueError(f"{path} is damaged: {error}") from error
     inside = sorted({file.parent for name in ("object.json", "store.json") for file in path.rglob(name)})
@@ -227,7 +227,7 @@ def _folder(path: Path) -> dict[str, Any]:
     }
 
 
-def _written(path: Path, nbytes: int) -> dict[str, Any]:
+def _describe_store(path: Path, nbytes: int) -> dict[str, Any]:
     """Describes a saved object or a store of blocks."""
     if (path / "object.json").exists():
         tree = json.loads(regular.json_object(path / "object.json", "the description of an object")["content"])["tree"]

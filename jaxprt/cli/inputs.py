@@ -28,7 +28,7 @@ from jaxprt.scene import mesh as meshes
 from jaxprt.scene.camera import orbit
 from jaxprt.scene.environment import rotate
 from jaxprt.scene.formats.mesh_file import SUFFIXES
-from jaxprt.scene.scene import centered, numbered
+from jaxprt.scene.scene import centered, unique_names
 from jaxprt.scene.sides import two_sided
 
 MODELS: dict[str, type] = {
@@ -78,7 +78,7 @@ def parse(text: str) -> Callable | TexturedMaterial:
     name, _, rest = text.partition(":")
     words = [word.strip() for word in rest.split(",")] if rest.strip() else []
     if name in FILES and ((words and "=" not in words[0]) or name not in MODELS):
-        return _measured(name, words)
+        return _load_measured(name, words)
     if name not in MODELS:
         names = ", ".join(dict.fromkeys([*MODELS, *FILES]))
         raise ValueError(f"a material must be one of {names}, got {name!r}")
@@ -135,7 +135,7 @@ def describe(material: Any) -> dict[str, Any]:
     return result
 
 
-def _measured(name: str, words: list[str]) -> Callable:
+def _load_measured(name: str, words: list[str]) -> Callable:
     load, takes = FILES[name]
     if not words or "=" in words[0]:
         raise ValueError(f"{name} must name a file, {form(name)}, got {', '.join(words) or 'none'}")
@@ -193,7 +193,7 @@ def kind(path: Path) -> str:
     return ""
 
 
-def told_apart(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+def split_files(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     """Separates files into meshes and environments.
 
     Raises:
@@ -219,10 +219,10 @@ def scene(options: SimpleNamespace, *, playable: bool = False) -> Scene:
     Raises:
         ValueError: A file is not a scene, a ground is requested without a mesh, or a part does not exist.
     """
-    paths, _ = told_apart(options.files)
+    paths, _ = split_files(options.files)
     if not paths and options.ground:
         raise ValueError("--ground needs a mesh: the embedded scene has a board")
-    result = _loaded(paths, options, playable) if paths else embedded(brdf=options.brdf, playable=playable)
+    result = _load_scenes(paths, options, playable) if paths else example_scene(brdf=options.brdf, playable=playable)
     parts = list(result.parts)
     for name, material in options.material:
         number = _number([part.name for part in parts], name)
@@ -234,7 +234,7 @@ def scene(options: SimpleNamespace, *, playable: bool = False) -> Scene:
     return refinement.divided(result, options.refine, **options_)[0]
 
 
-def embedded(*, brdf: Any = None, playable: bool = False) -> Scene:
+def example_scene(*, brdf: Any = None, playable: bool = False) -> Scene:
     """The embedded scene: chess pieces on a board."""
     pieces, light, dark = meshes.split(builtin.chess())
     matte = _matte if playable else Lambert
@@ -257,7 +257,7 @@ def lights(options: SimpleNamespace, *, size: int = _SIZE) -> dict[str, Environm
     Raises:
         ValueError: The size is not a power of two, or a file is not an environment.
     """
-    _, paths = told_apart(options.files)
+    _, paths = split_files(options.files)
     size = options.light_size or size
     if size & (size - 1):
         raise ValueError(f"--light-size must be a power of two, got {size}")
@@ -268,8 +268,8 @@ def lights(options: SimpleNamespace, *, size: int = _SIZE) -> dict[str, Environm
         environments = {"daylight": builtin.daylight(size=size), "studio": builtin.studio(size=size)}
     angles = options.turn
     if len(angles) == 1:
-        return {name: turned(light, angles[0]) for name, light in environments.items()}
-    return {f"{name}_{angle:g}": turned(light, angle) for name, light in environments.items() for angle in angles}
+        return {name: rotate_light(light, angles[0]) for name, light in environments.items()}
+    return {f"{name}_{angle:g}": rotate_light(light, angle) for name, light in environments.items() for angle in angles}
 
 
 def unique(names: Sequence[str]) -> list[str]:
@@ -281,7 +281,7 @@ def unique(names: Sequence[str]) -> list[str]:
     return result
 
 
-def turned(light: Environment, degrees: float) -> Environment:
+def rotate_light(light: Environment, degrees: float) -> Environment:
     """A light rotated about the vertical, counterclockwise as seen from above."""
     if degrees % 360 == 0:
         return light
@@ -299,19 +299,19 @@ def view(options: SimpleNamespace, *, size: int = _SIZE) -> View:
     looked, lit = two_sided(centered(scene(options))), lights(options, size=size)
     azimuth, elevation = np.radians([options.azimuth, options.elevation])
     # The board of the embedded scene and the ground may extend beyond the picture.
-    alone = not told_apart(options.files)[0]
+    alone = not split_files(options.files)[0]
     shown = looked.parts[:1] if alone else looked.parts[:-1] if options.ground else looked.parts
     edge = {"width": options.size, "height": options.size}
     camera = orbit(Scene(shown).mesh, azimuth=azimuth, elevation=elevation, **edge)
     return View(looked, lit, camera, tone=options.tone)
 
 
-def _loaded(paths: Sequence[Path], options: SimpleNamespace, playable: bool) -> Scene:
+def _load_scenes(paths: Sequence[Path], options: SimpleNamespace, playable: bool) -> Scene:
     """The scenes of all files as one upright scene, with a ground if requested."""
     turn = np.array(UPRIGHT[options.up])
     scenes = [load_scene(path, outside=options.outside) for path in paths]
     parts = [part for loaded in scenes for part in loaded.parts]
-    names = numbered([part.name for part in parts])
+    names = unique_names([part.name for part in parts])
     if options.up != "y":
         parts = [eqx.tree_at(lambda p: p.mesh, part, meshes.rotate(part.mesh, turn)) for part in parts]
     if playable:
@@ -321,12 +321,12 @@ def _loaded(paths: Sequence[Path], options: SimpleNamespace, playable: bool) -> 
     parts = [dataclasses.replace(part, name=name) for name, part in zip(names, parts, strict=True)]
     if options.ground:
         matte: Callable = _matte if playable else Lambert
-        name = numbered([*names, "ground"])[-1]
+        name = unique_names([*names, "ground"])[-1]
         parts.append(Part(name, meshes.ground_plane(Scene(parts).mesh), matte(0.5)))
     if options.up != "y":
         return Scene(parts)
     lamps = [lamp for loaded in scenes for lamp in loaded.point_lights]
-    names = numbered([*(part.name for part in parts), *(lamp.name for lamp in lamps)])[len(parts) :]
+    names = unique_names([*(part.name for part in parts), *(lamp.name for lamp in lamps)])[len(parts) :]
     lamps = [dataclasses.replace(lamp, name=name) for name, lamp in zip(names, lamps, strict=True)]
     return Scene(parts, scenes[0].cameras, point_lights=lamps)
 

@@ -46,11 +46,11 @@ class Program(click.Group):
             click.echo("jaxprt: stopped; the same command goes on from here", err=True)
             ctx.exit(_INTERRUPTED)
         except (ValueError, TypeError, FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
-            raise Refused(options.said(error)) from error
+            raise Refused(options.message_of(error)) from error
         except (OSError, RuntimeError, MemoryError) as error:
             if isinstance(error, click.exceptions.Exit | click.Abort):  # subclasses of RuntimeError
                 raise
-            raise click.ClickException(options.said(error)) from error
+            raise click.ClickException(options.message_of(error)) from error
 
 
 _EPILOG = f"""\b

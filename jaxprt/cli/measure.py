@@ -56,7 +56,7 @@ def command(**arguments: Any) -> None:
       jaxprt measure --fit ward:along=.1,across=.3 --system lobe
     """  # noqa: D301
     chosen = SimpleNamespace(**arguments)
-    with options.telling(chosen.as_json):
+    with options.reserve_stdout(chosen.as_json):
         result, text = _scene(chosen) if chosen.fit is None else _fit(chosen)
     options.tell(result, text, as_json=chosen.as_json)
 
@@ -70,14 +70,14 @@ def _scene(chosen: SimpleNamespace) -> tuple[dict[str, Any], str]:
     for system in systems:
         recipes = {"planned": None} if system == "planned" else options.recipes(system, chosen)
         for name, recipe in recipes.items():
-            ready = prepared(scene, lights, recipe, chosen, None if chosen.output is None else chosen.output / system)
+            ready = prepare(scene, lights, recipe, chosen, None if chosen.output is None else chosen.output / system)
             summary = ready.report(list(lights.values()))
-            reports[name] = described(summary, list(lights))
+            reports[name] = report_json(summary, list(lights))
             texts.append(f"{name}, in the light of {', '.join(lights)}:\n{summary}")
     return {"lights": list(lights), "systems": reports}, "\n".join(texts)
 
 
-def prepared(scene: Scene, lights: dict[str, Any], recipe: Any, chosen: SimpleNamespace, path: Any) -> RelitScene:
+def prepare(scene: Scene, lights: dict[str, Any], recipe: Any, chosen: SimpleNamespace, path: Any) -> RelitScene:
     """The scene, precomputed by a recipe, or by a plan if the recipe is None."""
     more: dict[str, Any] = {"system": recipe, "size": next(iter(lights.values())).radiance.shape[-2]}
     if recipe is None:
@@ -86,7 +86,7 @@ def prepared(scene: Scene, lights: dict[str, Any], recipe: Any, chosen: SimpleNa
     return precompute(scene, refine=False, **more)
 
 
-def described(summary: Report, lights: list[str]) -> dict[str, Any]:
+def report_json(summary: Report, lights: list[str]) -> dict[str, Any]:
     """A report as JSON."""
 
     def errors(values: Any) -> dict[str, float]:
@@ -114,7 +114,7 @@ def described(summary: Report, lights: list[str]) -> dict[str, Any]:
 
 def _fit(chosen: SimpleNamespace) -> tuple[dict[str, Any], str]:
     """Errors, times and bytes of a BRDF on a sphere, for the sizes of each system."""
-    if inputs.told_apart(chosen.files)[0]:
+    if inputs.split_files(chosen.files)[0]:
         raise click.UsageError(
             "--fit measures on a sphere and takes environments only, got a mesh: use --brdf to measure on the mesh"
         )

@@ -96,10 +96,10 @@ class Finite(click.ParamType):
         Raises:
             click.UsageError: The value is not a finite number in the range.
         """
-        number = _parsed(float, value)
+        number = _parse_number(float, value)
         if number is None or not math.isfinite(number) or not _inside(number, *self._ends, open=self._open):
             self.fail(
-                _required("a finite number", *self._ends, open=self._open, number=number, value=value), param, ctx
+                _requirement("a finite number", *self._ends, open=self._open, number=number, value=value), param, ctx
             )
         return number
 
@@ -113,15 +113,15 @@ class Whole(click.IntRange):
         Raises:
             click.UsageError: The value is not a whole number in the range.
         """
-        number = _parsed(int, value)
+        number = _parse_number(int, value)
         if number is None or not _inside(number, self.min, self.max, open=False):
             self.fail(
-                _required("a whole number", self.min, self.max, open=False, number=number, value=value), param, ctx
+                _requirement("a whole number", self.min, self.max, open=False, number=number, value=value), param, ctx
             )
         return number
 
 
-def _parsed(kind: Callable, value: Any) -> Any:
+def _parse_number(kind: Callable, value: Any) -> Any:
     """The value as a number; None if it is none."""
     try:
         return kind(value)
@@ -135,7 +135,7 @@ def _inside(number: int | float, least: int | float | None, most: int | float | 
     return (least is None or least <= number) and (most is None or number <= most)
 
 
-def _required(
+def _requirement(
     what: str, least: int | float | None, most: int | float | None, *, open: bool, number: Any, value: Any
 ) -> str:
     """The message for a value that is not such a number, or not in the range."""
@@ -226,7 +226,7 @@ class Material(click.ParamType):
         try:
             return inputs.parse(value) if isinstance(value, str) else value
         except (ValueError, OSError) as error:
-            self.fail(said(error), param, ctx)
+            self.fail(message_of(error), param, ctx)
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
         """Completes the name, then its parameters."""
@@ -261,7 +261,7 @@ class OfPart(Material):
         return part, super().convert(material, param, ctx)
 
 
-def said(error: Exception) -> str:
+def message_of(error: Exception) -> str:
     """The message of an error, without error numbers of the operating system."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
@@ -447,7 +447,7 @@ def folder(words: str, *, default: str | None = None) -> Callable:
 
 
 @contextlib.contextmanager
-def telling(result: bool) -> Iterator[None]:
+def reserve_stdout(result: bool) -> Iterator[None]:
     """Redirects other output to stderr if stdout is reserved for the result as JSON."""
     if not result:
         yield

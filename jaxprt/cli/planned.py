@@ -47,9 +47,9 @@ def command(**arguments: Any) -> None:
       jaxprt plan bunny.ply --brdf ggx:roughness=.2 --json > plan.json
     """  # noqa: D301
     chosen = SimpleNamespace(**arguments)
-    with options.telling(chosen.as_json):
+    with options.reserve_stdout(chosen.as_json):
         result = _plan(chosen)
-    options.tell(described(result), str(result), as_json=chosen.as_json)
+    options.tell(plan_json(result), str(result), as_json=chosen.as_json)
 
 
 def _plan(chosen: SimpleNamespace) -> Plan:
@@ -59,7 +59,7 @@ def _plan(chosen: SimpleNamespace) -> Plan:
         relight.make_folder(chosen.output)
         folder = chosen.output / "plan"
         if folder.exists():
-            stored = relight.saved(chosen.output)
+            stored = relight.load_plan(chosen.output)
             asked = ERROR if chosen.error is None else chosen.error
             if (stored.key, stored.asked, stored.rate) == (key_of(scene, lights), asked, chosen.rate):
                 return stored
@@ -72,7 +72,7 @@ def _plan(chosen: SimpleNamespace) -> Plan:
     return result
 
 
-def described(result: Plan) -> dict[str, Any]:
+def plan_json(result: Plan) -> dict[str, Any]:
     """A plan as JSON."""
 
     def candidate(option: Any) -> dict[str, Any]:

@@ -90,7 +90,7 @@ def command(**arguments: Any) -> None:
         server.close(patience=_PATIENCE)
 
 
-def chosen(arguments: Sequence[str]) -> SimpleNamespace:
+def parse_options(arguments: Sequence[str]) -> SimpleNamespace:
     """Parses arguments into options."""
     return SimpleNamespace(**command.make_context("view", list(arguments)).params)
 
@@ -147,11 +147,11 @@ def ready(chosen: SimpleNamespace) -> tuple[dict[str, RelitScene], dict[str, Env
             path = (
                 None if chosen.output is None else chosen.output / system
             )  # shared by systems with any number of lobes
-            systems[shown] = prepared(scene, lights, recipe, chosen.bounces, path)
+            systems[shown] = precompute_scene(scene, lights, recipe, chosen.bounces, path)
     return systems, lights
 
 
-def prepared(
+def precompute_scene(
     scene: Scene, lights: dict[str, Environment], recipe: Any, bounces: int | str, path: Path | None
 ) -> RelitScene:
     """The scene, precomputed by one recipe."""

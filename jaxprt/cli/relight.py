@@ -16,7 +16,7 @@ import numpy as np
 import jaxprt
 from jaxprt.cli import animation, inputs, options, report
 from jaxprt.cli.options import option
-from jaxprt.cli.report import Made, View
+from jaxprt.cli.report import Candidate, View
 from jaxprt.files import outputs
 from jaxprt.image.tonemap import TONES
 from jaxprt.relit.planning import Plan
@@ -39,7 +39,7 @@ SYSTEMS = ("planned", *options.NAMES, "dynamic")
 )
 @option(
     "--plan",
-    "saved",
+    "load_plan",
     group="System",
     type=click.Path(exists=True, path_type=Path, file_okay=False),
     help="Use the plan in this folder, written by `jaxprt plan`.",
@@ -89,7 +89,7 @@ def command(**arguments: Any) -> None:
       jaxprt relight scene.glb --system lobe --output shared --part 3/16
     """  # noqa: D301
     chosen = SimpleNamespace(**arguments)
-    with options.telling(chosen.as_json):
+    with options.reserve_stdout(chosen.as_json):
         summary = _run(chosen)
     if chosen.part is None:
         text = _text(summary, chosen.output / "report.json")
@@ -102,7 +102,7 @@ def command(**arguments: Any) -> None:
 def _run(chosen: SimpleNamespace) -> dict[str, Any]:
     """Draws and measures everything. If only a part is computed, reports what other parts must still do."""
     systems, part = _systems(chosen), _part(chosen.part)
-    plan = saved(chosen.saved) if chosen.saved is not None else None
+    plan = load_plan(chosen.saved) if chosen.saved is not None else None
     view = inputs.view(chosen, size=64 if plan is None else plan.size)
     options.check(chosen, systems, 6 * next(iter(view.lights.values())).radiance.shape[-2] ** 2)
     make_folder(chosen.output)
@@ -119,7 +119,7 @@ def _run(chosen: SimpleNamespace) -> dict[str, Any]:
             changing = animation.prepare(view, chosen.output, terms=terms, reflections=count)
             candidates[system] = animation.made(changing, view)
         else:
-            candidates |= _made(system, view, chosen, plan)
+            candidates |= _precompute(system, view, chosen, plan)
     summary["precompute"] = {system: candidate.cost for system, candidate in candidates.items()}
     _draw(summary, view, candidates, chosen.output)
     if changing is not None and chosen.animate:
@@ -136,7 +136,7 @@ def _run(chosen: SimpleNamespace) -> dict[str, Any]:
     return summary
 
 
-def _draw(summary: dict[str, Any], view: View, candidates: dict[str, Made], output: Path) -> None:
+def _draw(summary: dict[str, Any], view: View, candidates: dict[str, Candidate], output: Path) -> None:
     """Writes all pictures and adds their errors to the report."""
     drawn = report.draw(view, candidates)
     truth = report.exact(view, drawn)
@@ -156,7 +156,7 @@ def _draw(summary: dict[str, Any], view: View, candidates: dict[str, Made], outp
 
 def _systems(chosen: SimpleNamespace) -> tuple[str, ...]:
     """The requested systems. Refuses other options that do not fit them."""
-    embedded = not inputs.told_apart(chosen.files)[0]
+    embedded = not inputs.split_files(chosen.files)[0]
     plain = ("separable", "harmonic", "lobe") if embedded and chosen.error is chosen.saved is None else ("planned",)
     systems = chosen.system or plain
     for name, value, system in (
@@ -181,7 +181,7 @@ def _part(text: str | None) -> blocks.Part | None:
     return None if text is None else blocks.Part(int(number), int(count))
 
 
-def saved(folder: Path) -> Plan:
+def load_plan(folder: Path) -> Plan:
     """Loads the plan in a folder that `jaxprt plan` or a planned run has written.
 
     Raises:
@@ -219,15 +219,15 @@ def _share(
     left = []
     for system in systems:
         try:
-            _made(system, view, chosen, plan, part)
+            _precompute(system, view, chosen, plan, part)
         except blocks.UnfinishedError as error:
             left.append(str(error))
     return left
 
 
-def _made(
+def _precompute(
     system: str, view: View, chosen: SimpleNamespace, plan: Plan | None, part: blocks.Part | None = None
-) -> dict[str, Made]:
+) -> dict[str, Candidate]:
     """The scene, precomputed by one system, or by several sizes of it."""
     output, more = chosen.output, {"executor": part}
     if system == "planned" and plan is not None:
@@ -245,7 +245,7 @@ def _made(
 
 def _describe(view: View, chosen: SimpleNamespace) -> dict[str, Any]:
     """The head of the report: scene, lights, machine and versions."""
-    paths, lights = inputs.told_apart(chosen.files)
+    paths, lights = inputs.split_files(chosen.files)
     names = inputs.unique([path.stem for path in lights])
     return {
         "machine": {

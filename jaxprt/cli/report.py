@@ -61,7 +61,7 @@ class View(NamedTuple):
     tone: str = "srgb"
 
 
-class Made(NamedTuple):
+class Candidate(NamedTuple):
     """A scene that one system has precomputed.
 
     Attributes:
@@ -121,7 +121,7 @@ class Truth(NamedTuple):
 
 def plan(
     view: View, output: Path, *, error: float | None, bounces: int | str | None, executor: Executor | None = None
-) -> Made:
+) -> Candidate:
     """Precomputes a scene by a plan. The plan is stored too, so that the same command continues with the same plan.
 
     Raises:
@@ -129,7 +129,7 @@ def plan(
             what to do.
     """
     lights = list(view.lights.values())
-    candidate = _made(view, output, error=error, environments=lights, bounces=bounces, executor=executor)
+    candidate = _precompute(view, output, error=error, environments=lights, bounces=bounces, executor=executor)
     for part in objects.load(output / "plan").part:
         candidate.cost[part.name] = {"recipe": type(part.chosen.recipe).__name__, **vars(part.chosen.recipe)}
     return candidate
@@ -142,7 +142,7 @@ def make(
     *,
     bounces: int | str | None,
     executor: Executor | None = None,
-) -> Made:
+) -> Candidate:
     """Precomputes a scene by one recipe, or by one recipe for each part. Finished work is kept in a folder.
 
     Raises:
@@ -150,14 +150,14 @@ def make(
             what to do.
     """
     size = next(iter(view.lights.values())).radiance.shape[-2]
-    candidate = _made(view, output, system=recipe, size=size, bounces=bounces, executor=executor)
+    candidate = _precompute(view, output, system=recipe, size=size, bounces=bounces, executor=executor)
     for part in view.scene.parts:
         chosen = recipe[part.name] if isinstance(recipe, dict) else recipe
         candidate.cost[part.name] = {"recipe": type(chosen).__name__, **vars(chosen)}
     return candidate
 
 
-def _made(view: View, output: Path, **options: Any) -> Made:
+def _precompute(view: View, output: Path, **options: Any) -> Candidate:
     start, existed = timeit.default_timer(), output.exists()
     try:
         ready = relit.precompute(view.scene, refine=False, path=output, **options)
@@ -165,10 +165,10 @@ def _made(view: View, output: Path, **options: Any) -> Made:
         raise ValueError(f"{error}; on the command line, name another --output" if existed else str(error)) from error
     direct = ready.without_bounces()
     cost = {"seconds": timeit.default_timer() - start, "bytes": ready.nbytes}
-    return Made(direct, direct if ready.bounces is None else ready, direct.mesh, None, cost)
+    return Candidate(direct, direct if ready.bounces is None else ready, direct.mesh, None, cost)
 
 
-def draw(view: View, reports: dict[str, Made]) -> dict[str, list[Array]]:
+def draw(view: View, reports: dict[str, Candidate]) -> dict[str, list[Array]]:
     """Pictures under direct light by each system, for all lights."""
     return {
         system: candidate.pictures(list(view.lights.values()), view.camera) for system, candidate in reports.items()
@@ -185,7 +185,7 @@ def exact(view: View, drawn: dict[str, list[Array]]) -> Truth:
     picture = exact_picture(view.scene, shadings, lights, view.camera, most=POINTS, progress=True)
     seconds["picture"], start = timeit.default_timer() - start, timeit.default_timer()
     random = np.random.default_rng(0)
-    vertex = [random.permutation(vertices)[:VERTICES] for vertices in seen(view)]
+    vertex = [random.permutation(vertices)[:VERTICES] for vertices in visible_vertices(view)]
     radiance = exact_vertices(view, vertex)
     seconds["vertices"] = timeit.default_timer() - start
     return Truth(pixels, picture, vertex, radiance, seconds)
@@ -229,7 +229,7 @@ def _points(view: View) -> image.Pixels:
     return pixels.visible_points(mesh, view.camera, samples=4, hidden=hidden, occluder=occluder)
 
 
-def seen(view: View) -> list[np.ndarray]:
+def visible_vertices(view: View) -> list[np.ndarray]:
     """For each part, the vertices of the triangles in the picture."""
     vertex = np.unique(np.asarray(view.scene.mesh.face)[visible(view)])
     first = np.cumsum([0, *_counts(view.scene)])
@@ -241,7 +241,7 @@ def _counts(scene: Scene) -> list[int]:
 
 
 def compare(
-    view: View, candidates: dict[str, Made], drawn: dict[str, list[Array]], truth: Truth, output: Path
+    view: View, candidates: dict[str, Candidate], drawn: dict[str, list[Array]], truth: Truth, output: Path
 ) -> dict[str, dict[str, Any]]:
     """Writes the pictures and returns each system's errors under each light.
 
@@ -271,12 +271,12 @@ def compare(
         result[name]["exposure_stops"] = float(stops[name])
         result[name]["exact_pixels_error"] = float(truth.pixels.error[number])
         _write(output, f"{name}_reference", truth_picture, stops[name], tone=view.tone)
-        row = jnp.concatenate([*rows[name], _enlarged(truth_picture, view.camera)], 1)
+        row = jnp.concatenate([*rows[name], _enlarge(truth_picture, view.camera)], 1)
         files.write_png(output / f"{name}.png", np.asarray(image.display(row, tone=view.tone, stops=stops[name])))
     return result
 
 
-def _errors(view: View, name: str, candidate: Made, picture: Array, truth: Truth) -> dict[str, Any]:
+def _errors(view: View, name: str, candidate: Candidate, picture: Array, truth: Truth) -> dict[str, Any]:
     """Relative L2 errors of a picture and of vertices, and the number of vertices with negative radiance."""
     number, color = list(view.lights).index(name), candidate.color(view.lights[name], jnp.asarray(view.camera.eye))
     parts = jnp.split(color, np.cumsum(_counts(view.scene))[:-1])
@@ -292,7 +292,7 @@ def _errors(view: View, name: str, candidate: Made, picture: Array, truth: Truth
     }
 
 
-def reflect(view: View, system: str, candidate: Made, stops: dict[str, float], output: Path) -> dict[str, float]:
+def reflect(view: View, system: str, candidate: Candidate, stops: dict[str, float], output: Path) -> dict[str, float]:
     """Writes pictures that include interreflection. Returns its fraction of each picture's light."""
     lights, camera, pixels = list(view.lights.values()), view.camera, _points(view)
     direct, whole = (candidate.pictures(lights, camera, reflected=bounces) for bounces in (False, True))
@@ -304,7 +304,7 @@ def reflect(view: View, system: str, candidate: Made, stops: dict[str, float], o
     return result
 
 
-def _enlarged(picture: Array, camera: Camera) -> Array:
+def _enlarge(picture: Array, camera: Camera) -> Array:
     """A picture scaled to a camera's number of pixels by nearest neighbors."""
     row, column = (np.arange(n) * m // n for n, m in zip((camera.height, camera.width), picture.shape, strict=False))
     return picture[row][:, column]
@@ -316,7 +316,7 @@ def _write(output: Path, name: str, picture: Array, stops: Array, *, gain: float
     files.write_png(output / f"{name}.png", np.asarray(shown))
 
 
-def times(view: View, candidate: Made) -> dict[str, float]:
+def times(view: View, candidate: Candidate) -> dict[str, float]:
     """Median seconds per picture: with a new light from a cached view, and with a new view from the start."""
     light, camera = next(iter(view.lights.values())), view.camera
     edge = math.isqrt(_KEPT)

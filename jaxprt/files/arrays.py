@@ -201,11 +201,11 @@ class BlockStore:
         shapes = {name: [*at.shape, at.dtype] for name, at in layout.items()}
         header = {"format": _FORMAT, "version": VERSION, "blocks": blocks, "shapes": shapes, **header}
         near = dict(near or {})
-        files = {name: (_stored(at, blocks), at.dtype) for name, at in layout.items()}
+        files = {name: (_file_shape(at, blocks), at.dtype) for name, at in layout.items()}
         files[_CHECKSUM] = (blocks,), "uint32"
         if not self.path.exists():
             _create(self.path, {**header, "near": near}, files)
-        self._key = _open(self.path, header, near)
+        self._key = _check_store(self.path, header, near)
         self._offset = {name: _offset(self.path, name, *form) for name, form in files.items()}
 
     @property
@@ -294,7 +294,7 @@ class BlockStore:
         """
         at = self._layout[name]
         if not at.axis:
-            shape = _stored(at, self._blocks)
+            shape = _file_shape(at, self._blocks)
             return open_array(self.path / f"{name}.npy", self._offset[name], shape, at.dtype)[:count]
         size, before = at.shape[at.axis], (slice(None),) * at.axis
         result = empty((*at.shape[: at.axis], count, *at.shape[at.axis + 1 :]), at.dtype)
@@ -376,10 +376,10 @@ def _create(path: Path, header: Mapping[str, Any], files: Mapping[str, tuple[tup
         shutil.rmtree(aside, ignore_errors=True)
 
 
-def _open(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]) -> str:
+def _check_store(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]) -> str:
     """Refuses a store of other inputs. Returns the key of the store."""
     try:
-        stored = _found(path)
+        stored = _stored_header(path)
     except Exception as error:
         raise ValueError(
             f"{path} exists but is not a readable store of arrays, or is damaged ({error}); name another path"
@@ -407,7 +407,7 @@ def _open(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]
     return key
 
 
-def _found(path: Path) -> dict[str, Any]:
+def _stored_header(path: Path) -> dict[str, Any]:
     """The header of a store of the current version, or of a version up to 3, which zarr wrote."""
     old = path / "zarr.json"
     what = "the header of a store"
@@ -464,6 +464,6 @@ def _check_near(path: Path, stored: Any, near: Mapping[str, list[float]]) -> Non
             )
 
 
-def _stored(at: Layout, blocks: int) -> tuple[int, ...]:
+def _file_shape(at: Layout, blocks: int) -> tuple[int, ...]:
     """Shape of an array's file: that of the whole array if blocks are contiguous, else with a leading block axis."""
     return (blocks, *at.shape) if at.axis else (blocks * at.shape[0], *at.shape[1:])

@@ -122,7 +122,7 @@ def read_exr(path: pathlib.Path, name: str) -> tuple[Float32[np.ndarray, "h w c"
 def _headers(path: pathlib.Path, name: str) -> list[dict[str, typing.Any]]:
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
-            headers = [_well_formed(dict(part.header)) for part in file.parts]
+            headers = [_check_header(dict(part.header)) for part in file.parts]
     except Exception as error:  # OpenEXR raises several types for damaged files.
         raise ValueError(f"{name} must be an undamaged EXR file, got: {error}") from error
     if not headers:
@@ -130,7 +130,7 @@ def _headers(path: pathlib.Path, name: str) -> list[dict[str, typing.Any]]:
     return headers
 
 
-def _well_formed(header: dict[str, typing.Any]) -> dict[str, typing.Any]:
+def _check_header(header: dict[str, typing.Any]) -> dict[str, typing.Any]:
     """The header. Attributes of damaged files may have any type, and names any bytes, which raises any error here."""
     names = [channel.name for channel in header["channels"]]
     corners = [corner.tolist() for key in ("dataWindow", "displayWindow") for corner in header[key]]

@@ -500,10 +500,10 @@ def reduced(object: Any) -> tuple:
     """
     field = {item.name: getattr(object, item.name) for item in dataclasses.fields(object)}
     name = {key: text for key, value in field.items() if (text := function_name(value)) is not None}
-    return _restored, (type(object), {key: value for key, value in field.items() if key not in name}, name)
+    return _restore, (type(object), {key: value for key, value in field.items() if key not in name}, name)
 
 
-def _restored(kind: type, field: dict[str, Any], name: dict[str, str]) -> Any:
+def _restore(kind: type, field: dict[str, Any], name: dict[str, str]) -> Any:
     return construct(kind, field | {key: function(path) for key, path in name.items()})
 
 

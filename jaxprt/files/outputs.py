@@ -64,7 +64,7 @@ def replacing(path: str | os.PathLike) -> Iterator[pathlib.Path]:
     try:
         new.open("xb").close()
     except OSError as error:
-        raise _failed(path, error) from error
+        raise _name_error(path, error) from error
     try:
         yield new
         if mode is not None:
@@ -73,7 +73,7 @@ def replacing(path: str | os.PathLike) -> Iterator[pathlib.Path]:
             os.fsync(file.fileno())  # Some file systems report a full disk only here.
         new.replace(target)
     except OSError as error:
-        raise _failed(path, error) from error
+        raise _name_error(path, error) from error
     finally:
         new.unlink(missing_ok=True)
 
@@ -101,7 +101,7 @@ def _old_mode(path: str | os.PathLike, target: pathlib.Path) -> int | None:
             raise FileNotFoundError(f"{os.fspath(path)}: there is no folder {target.parent}") from None
         return None
     except OSError as error:
-        raise _failed(path, error) from error
+        raise _name_error(path, error) from error
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(f"{os.fspath(path)} must be a file, got a directory")
     if not stat.S_ISREG(mode):  # Renaming would put a file in place of the device.
@@ -111,7 +111,7 @@ def _old_mode(path: str | os.PathLike, target: pathlib.Path) -> int | None:
     return stat.S_IMODE(mode)
 
 
-def _failed(path: str | os.PathLike, error: OSError) -> OSError:
+def _name_error(path: str | os.PathLike, error: OSError) -> OSError:
     """The same error about the file that the caller named."""
     words = f"{os.fspath(path)} cannot be written: {error.strerror or error}"
     named = type(error)(words)

@@ -103,7 +103,7 @@ def shading_points(
     concrete = not isinstance(fragments.triangle, Tracer)
     if concrete and (highest := int(np.max(fragments.triangle))) >= len(mesh.face):
         raise ValueError(f"the fragments must refer to the mesh's {len(mesh.face)} triangles, got triangle {highest}")
-    projected, block = _projected(mesh, camera), min(BLOCK, 1 << (shape[0] * shape[1] - 1).bit_length())
+    projected, block = _project(mesh, camera), min(BLOCK, 1 << (shape[0] * shape[1] - 1).bit_length())
     facing = raster.front_faces(mesh, camera)
     uneven = jnp.zeros(len(mesh.face), bool) if uneven is None else uneven
     members, mixed, background = _uniform(fragments, facing, uneven)
@@ -116,11 +116,11 @@ def shading_points(
     for sample in _numbers(members.ravel(), block):
         triangle, pixel, coverage, corner, step = _points(sample, members, fragments, mesh.face, projected)
         if share is not None:
-            coverage = _shared(sample, members, share)
+            coverage = _sample_share(sample, members, share)
         linear = _linear(*corner)
         weight, rate = _weights(*linear, *step)
-        parts.append((triangle, *_packed(triangle, weight, rate, *linear[1:]), pixel, coverage))
-    triangle, barycentric, slope, pixel, coverage = _joined(parts)
+        parts.append((triangle, *_pack(triangle, weight, rate, *linear[1:]), pixel, coverage))
+    triangle, barycentric, slope, pixel, coverage = _concatenate(parts)
     if share is not None:
         background = _empty_share(fragments, share)
     return Pixels(triangle, barycentric, slope, pixel, coverage, background)
@@ -248,7 +248,7 @@ def _numbers(flag: Bool[Array, " n"] | UInt8[Array, " n"], block: int) -> list[I
     return [jax.device_put(row) for row in number.reshape(-1, block)]
 
 
-def _joined(parts: list[tuple[Array, ...]]) -> list[Any]:
+def _concatenate(parts: list[tuple[Array, ...]]) -> list[Any]:
     """Concatenated fields of all parts; outside of jax.jit in NumPy, and without most of the padding."""
     if isinstance(parts[0][0], Tracer):
         return list(parts[0])
@@ -283,7 +283,7 @@ def _uniform(fragments: Fragments, facing: Bool[Array, " f"], uneven: Bool[Array
 
 
 @jit
-def _projected(mesh: Mesh, camera: Camera) -> Float[Array, "3 v"]:
+def _project(mesh: Mesh, camera: Camera) -> Float[Array, "3 v"]:
     """Vertices projected by `raster.project`, as one array."""
     return jnp.stack(raster.project(*jax.lax.stop_gradient((mesh.position, camera))))
 
@@ -380,7 +380,7 @@ def _points(
 
 
 @jit
-def _shared(sample: Int[Array, " p"], members: UInt8[Array, "n s"], share: Float[Array, "h w s *c"]) -> Array:
+def _sample_share(sample: Int[Array, " p"], members: UInt8[Array, "n s"], share: Float[Array, "h w s *c"]) -> Array:
     """Coverage of the surfaces that some samples represent, by the shares of their samples."""
     samples = members.shape[1]
     used, sample = sample >= 0, jnp.maximum(sample, 0)
@@ -427,7 +427,7 @@ def _weights(value, right, down, across, along):
 
 
 @jit
-def _packed(triangle: Int[Array, " p"], weight, rate, *change) -> tuple[Float[Array, "p 3"], Float[Array, "p 2 3"]]:
+def _pack(triangle: Int[Array, " p"], weight, rate, *change) -> tuple[Float[Array, "p 3"], Float[Array, "p 2 3"]]:
     """Barycentric coordinates and their slopes; zero in padding."""
     slope = [[(part[i] - weight[i] * sum(part)) * rate for i in range(3)] for part in change]
     slope = jnp.stack([jnp.stack(component, -1) for component in slope], 1)

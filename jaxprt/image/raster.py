@@ -358,14 +358,14 @@ def _nearest(x, y, q, height: int, width: int, samples: int) -> tuple[Float[Arra
     def drawn(form: type[Narrow] | type[Wide]):
         nearest = form.blank(math.prod(shape), x.dtype)
         nearest = _draw(nearest, some & front, x, y, q, bounds, fine * width, fine)
-        hidden = _hidden(jnp.max(nearest.depth(x.dtype).reshape(shape), -1), q, bounds, TILE // fine)
+        hidden = _hidden_triangles(jnp.max(nearest.depth(x.dtype).reshape(shape), -1), q, bounds, TILE // fine)
         nearest = _draw(nearest, some & ~front & ~hidden, x, y, q, bounds, fine * width, fine)
         return nearest.depth(x.dtype).reshape(shape), nearest.triangle().reshape(shape)
 
     return jax.lax.platform_dependent(cpu=lambda: drawn(Narrow), default=lambda: drawn(Wide))
 
 
-def _hidden(depth: Float[Array, "h w"], q, bounds, tile: int) -> Bool[Array, " f"]:
+def _hidden_triangles(depth: Float[Array, "h w"], q, bounds, tile: int) -> Bool[Array, " f"]:
     """Triangles that lie behind everything drawn on the tiles that they touch. Large triangles are not tested.
 
     A tile's edge has TILE cells, which are `tile` pixels.

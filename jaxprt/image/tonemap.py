@@ -43,7 +43,7 @@ _SIGMOID = (15.5, -40.14, 31.96, -6.868, 0.4298, 0.1191, -0.00232)  # its coeffi
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of linear Rec. 709 RGB
 
 
-def toned(linear: Any, tone: str, xp: ModuleType) -> Any:
+def apply_curve(linear: Any, tone: str, xp: ModuleType) -> Any:
     """Applies a tone curve.
 
     Args:
@@ -223,9 +223,9 @@ def display(
     """
     if tone in ("agx", "aces") and radiance.shape[-1:] != (3,):
         raise ValueError(f"the radiance must have three colors for the tone {tone!r}, got {list(radiance.shape)}")
-    return _displayed(radiance, stops, tone=tone)
+    return _display(radiance, stops, tone=tone)
 
 
 @functools.partial(jit, static_argnames="tone")
-def _displayed(radiance: Float[Array, "*b"], stops: Float[Array, ""] | float, *, tone: str) -> Float[Array, "*b"]:
-    return encode_srgb(toned(radiance * jnp.exp2(jnp.asarray(stops, radiance.dtype)), tone, jnp))
+def _display(radiance: Float[Array, "*b"], stops: Float[Array, ""] | float, *, tone: str) -> Float[Array, "*b"]:
+    return encode_srgb(apply_curve(radiance * jnp.exp2(jnp.asarray(stops, radiance.dtype)), tone, jnp))

@@ -52,7 +52,7 @@ def light(
     Reference: Nocedal and Wright 2006, chapters 10 and 16.
     """
     _check(radiance, pixels)
-    first, unravel = solve.raveled(start, steps)
+    first, unravel = solve.ravel(start, steps)
     if not (isinstance(error, float | int | np.number) and 0 < error < np.inf):
         raise ValueError(f"the error must be a positive number, got {error!r}")
     low, high = (solve.bound(limits, start, none) for limits, none in ((lower, -np.inf), (upper, np.inf)))
@@ -100,13 +100,13 @@ def material(
     Reference: Madsen, Nielsen, Tingleff 2004, "Methods for non-linear least squares problems".
     """
     _check(radiance, pixels)
-    first, unravel = solve.raveled(start, steps)
+    first, unravel = solve.ravel(start, steps)
     if len(first) > solve.DENSE:
         required = f"at most {solve.DENSE} parameters can be fitted by this method"
         raise ValueError(f"{required}, got {len(first)}: use light for more")
     low, high = (solve.bound(limits, start, none) for limits, none in ((lower, -np.inf), (upper, np.inf)))
     solve.check(first, low, high)
-    free, bounded, pinned = solve.freed(first, low, high)
+    free, bounded, pinned = solve.unbound(first, low, high)
 
     def function(u):
         return pictures.residual(radiance, unravel(bounded(u)), pixels)
@@ -151,18 +151,18 @@ def jointly(
         raise TypeError(f"the start must be a light and a material, a pair, got {type(start).__name__}")
     dark, surface = start
     first = light(lambda trial, eye: radiance(trial, surface, eye), dark, pixels)
-    (lit, of_light), (parameters, of_material) = solve.raveled(first.value, steps), solve.raveled(surface, steps)
+    (lit, of_light), (parameters, of_material) = solve.ravel(first.value, steps), solve.ravel(surface, steps)
     if len(lit) + len(parameters) > solve.DENSE:
         required = f"light and material may have at most {solve.DENSE} parameters together"
         raise ValueError(f"{required}, got {len(lit)} and {len(parameters)}")
-    norm, brightness = (float(jnp.linalg.norm(vector)) for vector in (solve.raveled(dark, steps)[0], lit))
+    norm, brightness = (float(jnp.linalg.norm(vector)) for vector in (solve.ravel(dark, steps)[0], lit))
     if not (norm > 0 and brightness > 0):
         raise ValueError(
             f"the light must not be black, got norm {norm} at the start and {brightness} after the first fit"
         )
     low, high = (solve.bound(limits, surface, none) for limits, none in ((lower, -np.inf), (upper, np.inf)))
     solve.check(parameters, low, high)
-    free, bounded, pinned = solve.freed(parameters, low, high)
+    free, bounded, pinned = solve.unbound(parameters, low, high)
     size = norm if scale else brightness
 
     def whole(u: Array) -> Array:

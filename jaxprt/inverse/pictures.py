@@ -121,7 +121,7 @@ def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
     solve.outside(mesh, pictures)
     if not pictures:
         raise ValueError("at least one picture is needed, got none")
-    parts = [_seen(number, mesh, picture) for number, picture in enumerate(pictures)]
+    parts = [_picture_rows(number, mesh, picture) for number, picture in enumerate(pictures)]
     colors = {picture.image.shape[2] for picture in pictures}
     if len(colors) > 1:
         raise ValueError(f"all pictures must have the same number of colors, got {sorted(colors)}")
@@ -134,7 +134,7 @@ def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
     return Pixels(eye, jax.device_put(vertex), jax.device_put(weight), jax.device_put(value), len(mesh.position))
 
 
-def _seen(number: int, mesh: Mesh, picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _picture_rows(number: int, mesh: Mesh, picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices, weights and values of a picture's pixels."""
     if not isinstance(picture, Picture):
         raise TypeError(f"picture {number} must be a Picture, got {type(picture).__name__}")

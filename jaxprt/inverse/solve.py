@@ -37,7 +37,7 @@ _POWER = 20  # steps to the largest curvature
 _SAFETY = 1.1
 
 
-def raveled(start: PyTree, steps: int) -> tuple[Array, Callable]:
+def ravel(start: PyTree, steps: int) -> tuple[Array, Callable]:
     """The numbers of the start as one array, and the function that restores its structure."""
     if isinstance(steps, bool) or not isinstance(steps, int | np.integer):
         raise TypeError(f"steps must be a whole number, got {steps!r}")
@@ -101,7 +101,7 @@ def check(first: Array, low: np.ndarray, high: np.ndarray) -> None:
         )
 
 
-def freed(first: Array, low: np.ndarray, high: np.ndarray) -> tuple[Array, Callable, Callable]:
+def unbound(first: Array, low: np.ndarray, high: np.ndarray) -> tuple[Array, Callable, Callable]:
     """Unbounded variables for bounded numbers, the map back to the numbers, and which numbers are at a bound.
 
     A number between two bounds is the sine of its variable; a number with one bound is a hyperbola of it. A long step
@@ -176,7 +176,7 @@ def _slopes(function: Callable, x: Array) -> tuple[Float[Array, " m"], Float[Arr
     return _with_slopes(function)(x)
 
 
-def _determined(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _determined_directions(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Directions whose singular values are above rounding, and these values."""
     square, axis = np.linalg.eigh(rows @ rows.T)
     value = np.sqrt(np.maximum(square, 0))
@@ -231,7 +231,7 @@ def at_once(function: Callable, first: Array, unravel: Callable, error: float) -
     r, slope = _slopes(function, first)
     _finite(r, slope)
     before, rows = np.asarray(r, np.float64), np.asarray(slope, np.float64)
-    axis, value = _determined(rows)
+    axis, value = _determined_directions(rows)
     part = -(axis.T @ (rows @ before)) / value**2
     # What is determined of a direction does not depend on the others. The first pass leaves out those that only follow
     # what the numbers cannot explain, the second judges by what then remains; more would judge by light left out.
@@ -324,9 +324,9 @@ def marquardt(
             break
     rows, left = np.asarray(state.jac, np.float64).T, np.asarray(state.residual, np.float64)
     rows = np.where(pinned(free)[:, None], 0, rows)
-    axis, value = _determined(rows)
+    axis, value = _determined_directions(rows)
     deviation = _deviation(axis, _scores(axis, value, rows, left))
-    determined = axis if not held else _determined(rows[:, :-held])[0]
+    determined = axis if not held else _determined_directions(rows[:, :-held])[0]
     value, rate = jit(lambda u: jax.jvp(bounded, (u,), (jnp.ones_like(u),)))(free)
     known = np.isfinite(deviation)
     deviation = np.where(known, np.where(known, deviation, 0) * np.abs(rate), np.inf)

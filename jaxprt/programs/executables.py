@@ -1,8 +1,8 @@
 """Executables that a later process loads without tracing or compiling them.
 
-JAX's persistent cache spares compiling only. Tracing and lowering a large program take seconds too. `Kept` keeps the
-whole executable, for calls whose program can be named without tracing it: concrete arrays on the default CPU, and
-static values and containers that this package, Equinox or Python define. Everything else goes through `jax.jit`.
+JAX's persistent cache spares compiling only. Tracing and lowering a large program take seconds too. `StoredFunction`
+keeps the whole executable, for calls whose program can be named without tracing it: concrete arrays on the default CPU,
+and static values and containers that this package, Equinox or Python define. Everything else goes through `jax.jit`.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ _PACKAGE = pathlib.Path(__file__).parents[1]
 _STARTED = time.time()
 _KNOWN = ("builtins", "jaxprt", "equinox", "numpy", "jax", "jaxlib", "collections")  # packages whose code has a version
 _CLEAN = re.compile(r"<jax\._src\.core\.AxisEnv object at 0x[0-9a-f]+>")  # empty where no trace is under way
-_every: list["Kept"] = []
+_functions: list["Kept"] = []
 
 
 class UnnamedError(Exception):
@@ -60,11 +60,11 @@ def surroundings() -> str:
     )
     option = sorted(jax.config.values.items())
     backend = device.platform, device.device_kind, device.client.platform_version
-    return "\n".join([_fixed(), str(variable), str(option), str(backend), context])
+    return "\n".join([_process_facts(), str(variable), str(option), str(backend), context])
 
 
 @functools.cache
-def _fixed() -> str:
+def _process_facts() -> str:
     """Versions, the code of the package, and the processor."""
     digest = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*")):
@@ -83,7 +83,7 @@ def _fixed() -> str:
     return "\n".join([digest.hexdigest(), str(version), processor(), str(cores)])
 
 
-def described(value: Any) -> str:
+def describe(value: Any) -> str:
     """A text that names a static value or the structure of a pytree, the same in every process.
 
     Raises:
@@ -93,13 +93,13 @@ def described(value: Any) -> str:
     if value is None or kind in (bool, int, float, complex, str, bytes):
         return repr(value)
     if kind in (tuple, list):
-        return f"{kind.__name__}({','.join(map(described, value))})"
+        return f"{kind.__name__}({','.join(map(describe, value))})"
     if kind is dict:
-        return f"dict({','.join(f'{described(name)}:{described(item)}' for name, item in value.items())})"
+        return f"dict({','.join(f'{describe(name)}:{describe(item)}' for name, item in value.items())})"
     if isinstance(value, enum.Enum | np.dtype):
-        return f"{_known(kind)}.{value.name}"
+        return f"{_qualified_name(kind)}.{value.name}"
     if isinstance(value, type) or hasattr(value, "__qualname__"):
-        return _known(value)
+        return _qualified_name(value)
     structure = value if isinstance(value, jax.tree_util.PyTreeDef) else jax.tree.structure(value)
     node = structure.node_data()
     if structure is value and node is None:
@@ -108,10 +108,10 @@ def described(value: Any) -> str:
         raise UnnamedError(f"{kind}")
     if node[0] is type(None):
         return "None"
-    return f"{_known(node[0])}<{described(node[1])}>({','.join(map(described, structure.children()))})"
+    return f"{_qualified_name(node[0])}<{describe(node[1])}>({','.join(map(describe, structure.children()))})"
 
 
-def _known(thing: Any) -> str:
+def _qualified_name(thing: Any) -> str:
     """Name of a class or function at the top level of a module whose code has a version."""
     module, name = thing.__module__, thing.__qualname__
     target: Any = sys.modules.get(module)
@@ -124,7 +124,7 @@ def _known(thing: Any) -> str:
     return f"{module}.{name}"
 
 
-class Kept:
+class StoredFunction:
     """A compiled function. Executables of calls with concrete arrays are kept for later processes.
 
     Other attributes are those of the function that `jax.jit` returned. The function must be at the top level of a
@@ -141,7 +141,7 @@ class Kept:
         self._function, self._compiled, self._static = function, compiled, static
         self._executables: dict[Any, Any] = {}
         self._lock = threading.RLock()
-        _every.append(self)
+        _functions.append(self)
 
     def __call__(self, *argument: PyTree, **named: Any) -> PyTree:
         """Calls the function."""
@@ -179,34 +179,34 @@ class Kept:
         argument, named = operand
         aval = tuple((shape, str(dtype), weak) for shape, dtype, weak in aval)
         try:
-            parts = (surroundings(), *map(described, (self._function, tree, aval, option)))
+            parts = (surroundings(), *map(describe, (self._function, tree, aval, option)))
             name = hashlib.sha256("\n".join(parts).encode()).hexdigest()
         except Exception:  # no name, or none that can be found: classes of users may do anything
             return functools.partial(self._compiled, **option)
-        content = jax_cache.kept().read(name)
+        content = jax_cache.process_store().read(name)
         if content is not None:
             with contextlib.suppress(Exception):  # of any kind: what can go wrong is up to JAX and XLA
-                return _loaded(content, tree)
+                return _unpack(content, tree)
         lowered = self._compiled.lower(*argument, **named, **option)
         with jax_cache.paused():  # An executable that comes from JAX's cache cannot be written again.
             executable = lowered.compile()
         # Custom calls are addresses in this process, or need libraries that JAX prepares when it traces.
         if not _calls_out(lowered) and jax_cache.loads_quietly():
             with contextlib.suppress(Exception):
-                content = _packed(executable)
-                _loaded(content, tree)  # or an error
-                jax_cache.kept().write(name, content)
+                content = _pack(executable)
+                _unpack(content, tree)  # or an error
+                jax_cache.process_store().write(name, content)
         return executable
 
 
 def count() -> int:
     """Number of executables that this process holds."""
-    return sum(len(program._executables) for program in _every)
+    return sum(len(program._executables) for program in _functions)
 
 
 def forget() -> None:
     """Forgets the executables of this process, as `jax.clear_caches` forgets other programs."""
-    for program in _every:
+    for program in _functions:
         program.forget()
 
 
@@ -244,13 +244,13 @@ def _calls_out(lowered: Any) -> bool:
     return "custom_call" in text
 
 
-def _packed(executable: Any) -> bytes:
+def _pack(executable: Any) -> bytes:
     content, _, out = serialize_executable.serialize(executable)
     # Structures of results cannot be pickled, but results with numbers in place of arrays can.
     return zlib.compress(pickle.dumps((content, out.unflatten(range(out.num_leaves)))), 1)
 
 
-def _loaded(content: bytes, tree: Any) -> Callable:
+def _unpack(content: bytes, tree: Any) -> Callable:
     # The store has made sure that the user wrote the file.
     executable, example = pickle.loads(zlib.decompress(content))
     return serialize_executable.deserialize_and_load(

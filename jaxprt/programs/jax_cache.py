@@ -21,7 +21,7 @@ from jax._src.compilation_cache_interface import CacheInterface
 from jax._src.lib import version_str
 from jax.experimental import serialize_executable
 
-from jaxprt.programs.store import Store, folder, log, processor, wanted
+from jaxprt.programs.store import Store, folder, is_enabled, log, processor
 
 _THRESHOLD = "jax_persistent_cache_min_compile_time_secs"
 _DEFAULTS = {
@@ -45,38 +45,38 @@ class Cache(CacheInterface):
 
     def get(self, key: str) -> Any:
         """A program as JAX has packed it; None if there is none, or if the user has configured JAX's cache since."""
-        if _configured():
+        if _is_configured():
             _remove(self)
             return None
         return None if _is_paused() else self.store.read(_name(key))
 
     def put(self, key: str, value: bytes) -> None:
         """Keeps a program as JAX has packed it, where XLA will load it without complaint."""
-        if not (_configured() or _is_paused()) and loads_quietly():
+        if not (_is_configured() or _is_paused()) and loads_quietly():
             self.store.write(_name(key), value)
 
 
 @functools.cache
-def kept() -> Store:
+def process_store() -> Store:
     """The store of this process."""
     return Store(folder())
 
 
 def install() -> None:
     """Gives JAX the cache, unless programs are not wanted, or the user or a program has configured JAX's own."""
-    if not wanted() or any(name.startswith(_VARIABLES) for name in os.environ) or _configured():
+    if not is_enabled() or any(name.startswith(_VARIABLES) for name in os.environ) or _is_configured():
         return
     with compilation_cache._cache_initialized_mutex:
         if compilation_cache._cache_initialized:
             return
-        compilation_cache._cache = Cache(kept())
+        compilation_cache._cache = Cache(process_store())
         compilation_cache._cache_initialized = True
     jax.config.update(_THRESHOLD, 0.0)
 
 
 def active() -> bool:
     """Whether JAX uses this cache."""
-    return isinstance(compilation_cache._cache, Cache) and not _configured()
+    return isinstance(compilation_cache._cache, Cache) and not _is_configured()
 
 
 @contextlib.contextmanager
@@ -93,7 +93,7 @@ def _is_paused() -> bool:
     return getattr(_thread, "paused", False)
 
 
-def _configured() -> bool:
+def _is_configured() -> bool:
     """Whether an option of JAX's cache has another value than JAX's default."""
     installed = isinstance(compilation_cache._cache, Cache)  # then the threshold has been set here
     return any(
@@ -133,10 +133,10 @@ def loads_quietly() -> bool:
     if jax.default_backend() != "cpu":
         return True
     name = _name(f"quiet {jax.__version__} {version_str} {os.environ.get('XLA_FLAGS')}")
-    answer = kept().read(name)
+    answer = process_store().read(name)
     if answer is None:
         answer = b"1" if _quiet() else b"0"
-        kept().write(name, answer)
+        process_store().write(name, answer)
         if answer == b"0":
             log.warning(
                 "compiled programs are not kept on this processor, because XLA reports each that it loads "

@@ -30,7 +30,7 @@ _FEATURES = ("vendor_id", "cpu family", "model", "stepping", "flags", "Features"
 log = logging.getLogger("jaxprt")
 
 
-def wanted() -> bool:
+def is_enabled() -> bool:
     """Whether programs are kept: not if the environment variable JAXPRT_KEEP_PROGRAMS is 0."""
     return os.environ.get("JAXPRT_KEEP_PROGRAMS", "1") != "0"
 
@@ -79,7 +79,7 @@ class Store:
         """Content of a file; None if there is no such file, or if it is damaged or belongs to another user."""
         path = self.folder / name
         try:
-            if not _trusted(self.folder):
+            if not _is_trusted(self.folder):
                 return None
             with path.open("rb") as file:
                 if not _private(os.fstat(file.fileno())):
@@ -99,7 +99,7 @@ class Store:
         if not self._writable or len(content) > self.most * (1 - _LEFT):
             return
         try:
-            self._writable = _made(self.folder)
+            self._writable = _make_folder(self.folder)
             if self._writable:
                 _replace(self.folder / name, _digest(name, content) + content)
                 self._bound(len(content))
@@ -147,20 +147,20 @@ def _replace(path: pathlib.Path, content: bytes) -> None:
         raise
 
 
-def _made(folder: pathlib.Path) -> bool:
+def _make_folder(folder: pathlib.Path) -> bool:
     """Creates the folder if it is absent, in a folder of the user, and says whether it can be trusted."""
     if not folder.exists():
         parent = next(parent for parent in folder.parents if parent.exists())
-        if not folder.is_absolute() or not _owned(parent.stat()):  # for example the home of the user who called sudo
+        if not folder.is_absolute() or not _is_owner(parent.stat()):  # for example the home of the user who called sudo
             return False
         for directory in (*reversed(folder.parents), folder):
             directory.mkdir(mode=0o700, exist_ok=True)
-    return _trusted(folder)
+    return _is_trusted(folder)
 
 
-def _trusted(folder: pathlib.Path) -> bool:
+def _is_trusted(folder: pathlib.Path) -> bool:
     status = folder.stat()
-    if _owned(status) and not _private(status):
+    if _is_owner(status) and not _private(status):
         _warn_of(folder)
     return stat.S_ISDIR(status.st_mode) and _private(status)
 
@@ -170,10 +170,10 @@ def _warn_of(folder: pathlib.Path) -> None:
     log.warning("compiled programs are not kept: other users may write into %s; chmod 700 makes it private", folder)
 
 
-def _owned(status: os.stat_result) -> bool:
+def _is_owner(status: os.stat_result) -> bool:
     return not hasattr(os, "geteuid") or status.st_uid == os.geteuid()
 
 
 def _private(status: os.stat_result) -> bool:
     """Whether a file or folder belongs to the user, and nobody else may write into it."""
-    return _owned(status) and (os.name != "posix" or not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
+    return _is_owner(status) and (os.name != "posix" or not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH))

@@ -10,7 +10,7 @@ from jaxprt.image import raster, rasterize, shading_points
 from jaxprt.image.pixels import Pixels
 from jaxprt.relit import canvas
 from jaxprt.scene import Camera, Environment, Mesh
-from jaxprt.scene.camera import localized
+from jaxprt.scene.camera import localize
 from jaxprt.scene.points import Points
 from jaxprt.systems.protocol import System
 
@@ -72,7 +72,7 @@ def of_regions(
         samples: Number of coverage samples of each pixel: 4 or 1.
         keep: Whether to store what depends on the view, for many lights: about a kilobyte for each point.
     """
-    mesh, camera = localized(mesh, camera)
+    mesh, camera = localize(mesh, camera)
     pixels = shading_points(rasterize(mesh, camera, samples=samples), mesh, camera)
     region, face, triangle = (np.asarray(each) for each in (mesh.region, mesh.face, pixels.triangle))
     owner = np.where(triangle >= 0, region[face[triangle, 0]], -1)

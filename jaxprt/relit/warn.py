@@ -13,7 +13,7 @@ from jaxprt.image import raster
 from jaxprt.relit import paths
 from jaxprt.relit.channels import Shading
 from jaxprt.scene import Camera, Mesh, Part, Scene, TexturedMaterial
-from jaxprt.scene.camera import localized
+from jaxprt.scene.camera import localize
 from jaxprt.scene.mesh import bounds
 from jaxprt.visibility import Occluder
 from jaxprt.visibility.rays import hits_front
@@ -36,7 +36,7 @@ def of_backs(scene: Scene, mesh: Mesh, camera: Camera) -> None:
         mesh: The mesh of all parts, `scene.mesh`.
         camera: The camera.
     """
-    mesh, near = localized(mesh, camera)
+    mesh, near = localize(mesh, camera)
     way = raster.ray_direction(dataclasses.replace(near, width=_RAYS, height=_RAYS))
     way, occluder = np.asarray(way, np.float32).reshape(-1, 3), Occluder(mesh)
     triangle, *_ = occluder.hit(np.tile(np.asarray(near.eye, np.float32), (len(way), 1)), way)

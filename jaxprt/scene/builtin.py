@@ -180,7 +180,7 @@ def daylight(*, size: int = 64) -> Environment:
     sky = np.where(up > 0, sky, ground + (0.5 * horizon - ground) * np.exp(12 * np.minimum(up, 0)))
     texel = np.pi / 2 / direction.shape[1]
     disk = np.clip((_SUN_RADIUS - angle) / texel + 0.5, 0, 1) * np.array([1.15, 1.0, 0.85])
-    return Environment(jnp.asarray(_exposed(sky, size) / 2 + _exposed(disk, size) / 2, jnp.float32))
+    return Environment(jnp.asarray(_expose(sky, size) / 2 + _expose(disk, size) / 2, jnp.float32))
 
 
 def studio(*, size: int = 64) -> Environment:
@@ -211,7 +211,7 @@ def studio(*, size: int = 64) -> Environment:
             edge = np.clip((limit - place) / 0.05 + 0.5, 0, 1)
             inside = inside * edge**2 * (3 - 2 * edge)
         radiance = radiance + inside[..., None] * strength * np.array(color)
-    return Environment(jnp.asarray(_exposed(radiance, size), jnp.float32))
+    return Environment(jnp.asarray(_expose(radiance, size), jnp.float32))
 
 
 def _fine_direction(size: int) -> np.ndarray:
@@ -221,7 +221,7 @@ def _fine_direction(size: int) -> np.ndarray:
     return np.asarray(cubemap.direction(size=size * max(4, -(-256 // size))), np.float64)
 
 
-def _exposed(radiance: np.ndarray, size: int) -> np.ndarray:
+def _expose(radiance: np.ndarray, size: int) -> np.ndarray:
     """Means over texels, scaled so that the irradiance on a plane that faces up is pi, averaged over the colors."""
     part = radiance.shape[1] // size
     shape = (6, size, part, size, part, -1)

@@ -76,7 +76,7 @@ class Camera(eqx.Module):
         return dataclasses.replace(self, eye=eye, target=target)
 
 
-def localized(mesh: Mesh, camera: Camera) -> tuple[Mesh, Camera]:
+def localize(mesh: Mesh, camera: Camera) -> tuple[Mesh, Camera]:
     """A mesh and a camera in common coordinates near zero.
 
     The mesh's origin becomes zero and the camera relative to it. A camera at large coordinates and a mesh without
@@ -103,7 +103,7 @@ def in_common_coordinates(function: Function) -> Function:
             exact = any(isinstance(position, np.ndarray) for position in (camera.eye, camera.target))
             arguments["camera"] = camera.local(tuple(np.asarray(camera.eye, float).tolist())) if exact else camera
         elif isinstance(arguments["mesh"], Mesh):
-            mesh, arguments["camera"] = localized(arguments["mesh"], camera)
+            mesh, arguments["camera"] = localize(arguments["mesh"], camera)
             # Opacity is for rays; programs for all scenes are the same.
             arguments["mesh"] = mesh if mesh.opacity is None else dataclasses.replace(mesh, opacity=None)
         return function(*bound.args, **bound.kwargs)

@@ -54,7 +54,7 @@ def importance(environments: Sequence[Environment], *, count: int) -> LightSampl
         require.kind(f"environment {number}", light, Environment, source="jaxprt.load_environment")
         require.array(f"the radiance of environment {number}", light.radiance, "6 n n c")
     colors = max(light.radiance.shape[-1] for light in environments)
-    samples = [_sampled(np.asarray(light.radiance, np.float64), count) for light in environments]
+    samples = [_sample(np.asarray(light.radiance, np.float64), count) for light in environments]
     weight = np.zeros((len(samples), count, len(samples), colors), np.float32)
     for number, (_, weights) in enumerate(samples):
         weight[number, :, number, : weights.shape[-1]] = weights
@@ -83,7 +83,7 @@ def natural(*, size: int, degree: int) -> LightSamples:
     return LightSamples(direction.astype(np.float32), weight[:, None].astype(np.float32))
 
 
-def _sampled(radiance: np.ndarray, count: int) -> tuple[Float[np.ndarray, "d 3"], Float[np.ndarray, "d c"]]:
+def _sample(radiance: np.ndarray, count: int) -> tuple[Float[np.ndarray, "d 3"], Float[np.ndarray, "d c"]]:
     """Directions that sample one light, and their weights."""
     size = radiance.shape[1]
     order = _curve(size)

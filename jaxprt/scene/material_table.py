@@ -183,11 +183,11 @@ class MaterialTable(eqx.Module):
         """
         count = len(points)
         if count == ROW or not count or not known(points) or points.corner.shape[0] != 3:
-            return _looked(self, points)
+            return _evaluate(self, points)
         index = np.minimum(np.arange(-(-count // ROW) * ROW), count - 1).reshape(-1, ROW)
         host = jax.tree.map(np.asarray, points)
         slope = np.zeros((2, *host.weight.shape), host.weight.dtype) if host.slope is None else host.slope
-        rows = [_looked(self, put(Points(host.corner[:, n], host.weight[:, n], slope[..., n]))) for n in index]
+        rows = [_evaluate(self, put(Points(host.corner[:, n], host.weight[:, n], slope[..., n]))) for n in index]
         xp = np if known(rows) else jnp
         return jax.tree.map(lambda *row: xp.concatenate(row)[:count], *rows)
 
@@ -204,7 +204,7 @@ def at_vertices(vertex: Int[np.ndarray, " p"]) -> Points:
 
 
 @kept
-def _looked(table: MaterialTable, points: Points) -> Look:
+def _evaluate(table: MaterialTable, points: Points) -> Look:
     values, layers = _values(table, points)
     normal = None
     if table.frame is not None:
@@ -223,10 +223,10 @@ def _looked(table: MaterialTable, points: Points) -> Look:
     if layers is None:
         return look
     coated = table.factor[:, _SHINY + 1][table.part[points.corner[0]]] > 0
-    return _layered(look, layers, coated)
+    return _under_layers(look, layers, coated)
 
 
-def _layered(look: Look, layers: Layers, coated: Bool[Array, " p"]) -> Look:
+def _under_layers(look: Look, layers: Layers, coated: Bool[Array, " p"]) -> Look:
     """The materials with their layers: what is under a coat or a sheen, and less diffuse light where light passes."""
     coat, passing = layers.clearcoat, 1 - layers.transmission
     base = look.coefficient * jnp.stack([passing, jnp.ones_like(coat), jnp.ones_like(coat), passing], 1)[..., None]
@@ -324,13 +324,13 @@ def _read(
 
     def image_values() -> Array:
         moved, moving = _in_image(table, part, place, texture)
-        value = _looked_up(table.texels, jnp.maximum(image, 0), moved, moving, table.wrap[part, texture])
+        value = _look_up(table.texels, jnp.maximum(image, 0), moved, moving, table.wrap[part, texture])
         return jnp.where(image[:, None] >= 0, value, 1)
 
     return jax.lax.cond(jnp.any(image >= 0), image_values, lambda: jnp.ones((len(points), 3), table.texels.value.dtype))
 
 
-def _looked_up(
+def _look_up(
     texels: Texels,
     image: Int[Array, " p"],
     coordinate: Float[Array, "p 2"],
@@ -419,7 +419,7 @@ def of_parts(parts: Sequence[Part]) -> MaterialTable:
     def column(values: Sequence[Any], otherwise: float, width: int) -> Any:
         pairs = zip(count, values, strict=True)
         rows = [np.full((n, width), otherwise, dtype) if value is None else value for n, value in pairs]
-        return _concatenated([*rows, np.full((room, width), otherwise, dtype)], dtype)
+        return _concatenate([*rows, np.full((room, width), otherwise, dtype)], dtype)
 
     first = column([part.mesh.texture for part in parts], 0.0, 2)
     second = column([part.mesh.texture if part.second is None else part.second for part in parts], 0.0, 2)
@@ -526,17 +526,17 @@ def _rows(
             image[row, column] = number[_key(name, source)]
             sets[row, column] = source.set
             wrap[row, column] = [texture.WRAPS.index(mode) for mode in source.wrap]
-            transform = _placed(transform, (row, column), source.transform)
-    factor = _concatenated([_factors(material, layered)[None] for material in materials], dtype)
+            transform = _set_at(transform, (row, column), source.transform)
+    factor = _concatenate([_factors(material, layered)[None] for material in materials], dtype)
     padding = np.zeros((rows - len(materials), factor.shape[1]), dtype)
     columns = {"image": image, "transform": transform, "set": sets, "wrap": wrap, "texels": texels}
     if tilted:
         scale = [np.reshape(getattr(material, "normal_scale", 1.0), 1) for material in materials]
-        columns["normal_scale"] = _concatenated([*scale, np.ones(rows - len(materials))], dtype)
-    return {"factor": _concatenated([factor, padding], dtype), **columns}
+        columns["normal_scale"] = _concatenate([*scale, np.ones(rows - len(materials))], dtype)
+    return {"factor": _concatenate([factor, padding], dtype), **columns}
 
 
-def _placed(array: Any, place: tuple[int, int], value: Any) -> Any:
+def _set_at(array: Any, place: tuple[int, int], value: Any) -> Any:
     """The array with another value at a place."""
     if isinstance(value, Tracer) or isinstance(array, Tracer):
         return jnp.asarray(array).at[place].set(value)
@@ -558,7 +558,7 @@ def _factors(material: TexturedMaterial | Callable, layered: bool) -> Any:
     return xp.hstack([*(getattr(textured, name) for name, _ in _FACTORS), 0, *rest])
 
 
-def _concatenated(rows: Sequence[Any], dtype: Any) -> Any:
+def _concatenate(rows: Sequence[Any], dtype: Any) -> Any:
     return jnp.concatenate(rows).astype(dtype) if not known(rows) else np.concatenate(rows).astype(dtype)
 
 
@@ -578,5 +578,5 @@ def _texels(images: Mapping[tuple[int, bool], Any], dtype: Any, least: Texels | 
     if total >= 1 << 31:
         raise ValueError(f"textures must have fewer than 2^31 values with their mip maps, got {total}")
     size = max(shared_size(total, fine=total > _SMALL), room)
-    value = _concatenated([*values, np.ones(size - total, dtype)], dtype)
+    value = _concatenate([*values, np.ones(size - total, dtype)], dtype)
     return Texels(value, start.astype(np.int32), shape, channels)

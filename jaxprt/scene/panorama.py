@@ -74,7 +74,7 @@ class Panorama:
         width = np.ascontiguousarray(np.broadcast_to(np.asarray(angle, np.float32), len(ray)))
         color = np.empty((len(ray), 3), np.float32)
         levels = self.half, self.radiance, self.first, self.height, self.width
-        panorama_loops.sampled(*levels, self.cube, self.turn, ray, width, color)
+        panorama_loops.sample(*levels, self.cube, self.turn, ray, width, color)
         if len(self.disk):
             panorama_loops.add_disks(self.disk, ray, width, color)
         return color
@@ -134,10 +134,10 @@ def from_latlong(image: Float[np.ndarray, "h w 3"], *, on_edge: bool) -> Panoram
         on_edge: Whether pixels are samples that include both poles and both ends of the longitude.
     """
     if on_edge:
-        image = _centered(_centered(image, 0), 1)
+        image = _center_pixels(_center_pixels(image, 0), 1)
     image = image[None]
     while image.shape[2] > WIDEST:
-        image = _halved(image, latlong=True)
+        image = _halve(image, latlong=True)
     return _pyramid(image, latlong=True)
 
 
@@ -149,9 +149,9 @@ def from_faces(face: Float[np.ndarray, "6 n n 3"], *, on_edge: bool) -> Panorama
         on_edge: Whether pixels are samples that include the edges of the faces.
     """
     if on_edge:
-        face = _centered(_centered(face, 1), 2)
+        face = _center_pixels(_center_pixels(face, 1), 2)
     while 4 * face.shape[2] > WIDEST:
-        face = _halved(face, latlong=False)
+        face = _halve(face, latlong=False)
     return _pyramid(face, latlong=False)
 
 
@@ -167,7 +167,7 @@ def _pyramid(image: np.ndarray, *, latlong: bool) -> Panorama:
         levels.append(scaled.reshape(-1, 3).astype(np.float16).view(np.uint16))
         if max(shapes[-1]) <= 2:
             break
-        image = _halved(image, latlong=latlong)
+        image = _halve(image, latlong=latlong)
     with np.errstate(over="ignore", invalid="ignore"):  # patterns of infinity and NaN, which no pixel has
         radiance = (np.arange(2**16, dtype=np.uint16).view(np.float16).astype(np.float64) / scale).astype(np.float32)
     first = np.cumsum([0, *map(len, levels[:-1])])
@@ -199,25 +199,25 @@ def _isotropic(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     for row in np.flatnonzero(span > 1):
         around = np.cumsum(np.concatenate([np.zeros((1, 3)), image[row], image[row], image[row]]), 0)
         middle = width + 0.5 + np.arange(width)
-        total = _between(around, middle + span[row] / 2) - _between(around, middle - span[row] / 2)
+        total = _interpolate_rows(around, middle + span[row] / 2) - _interpolate_rows(around, middle - span[row] / 2)
         result[row] = total / span[row]
     return result
 
 
-def _between(value: np.ndarray, place: np.ndarray) -> np.ndarray:
+def _interpolate_rows(value: np.ndarray, place: np.ndarray) -> np.ndarray:
     """Rows of an array at fractional places, interpolated linearly."""
     row = np.minimum(place.astype(int), len(value) - 2)
     share = (place - row)[:, None]
     return (1 - share) * value[row] + share * value[row + 1]
 
 
-def _centered(image: np.ndarray, axis: int) -> np.ndarray:
+def _center_pixels(image: np.ndarray, axis: int) -> np.ndarray:
     """Pixels of one width for samples that include both ends of an axis: two for each, one at each end."""
     count = image.shape[axis]
     return image if count == 1 else np.take(image, np.arange(1, 2 * count - 1) // 2, axis)
 
 
-def _halved(image: np.ndarray, *, latlong: bool) -> np.ndarray:
+def _halve(image: np.ndarray, *, latlong: bool) -> np.ndarray:
     """Means over 2 x 2 pixels, or a little less where a number of rows or columns is odd."""
     height, width = image.shape[1:3]
     down = np.sin(np.pi / 2 * np.linspace(-1, 1, height + 1)) if latlong else np.linspace(-1, 1, height + 1)

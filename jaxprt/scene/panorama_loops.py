@@ -96,7 +96,7 @@ def _bilinear(half, radiance, first, cube, height, width, face, down, right):
 
 @no_type_check
 @_compiled
-def sampled(half, radiance, first, height, width, cube, turn, direction, angle, color):
+def sample(half, radiance, first, height, width, cube, turn, direction, angle, color):
     """Radiance from some directions: bilinear within a level and linear between two levels.
 
     `angle` is the width of the pixel around each direction in radians: the level is the one whose pixels are as wide.

@@ -41,7 +41,7 @@ class Points(eqx.Module):
 
     def carry(self, attribute: Num[Array | np.ndarray, "..."], *, axis: int = 0) -> Float[Array, "..."]:
         """Interpolates a vertex attribute at the points. The vertices are along `axis`; the result is linear in it."""
-        return _carried(self.corner, self.weight, attribute, axis=axis)
+        return _carry(self.corner, self.weight, attribute, axis=axis)
 
     def slopes(self, attribute: Float[Array | np.ndarray, "v c"]) -> Float[Array, "2 p c"]:
         """Change of a vertex attribute from one pixel to the next, to the right and down."""
@@ -81,7 +81,7 @@ class Points(eqx.Module):
 
 
 @partial(jit, static_argnames="axis")
-def _carried(corner: Array, weight: Array, attribute: Array, *, axis: int) -> Array:
+def _carry(corner: Array, weight: Array, attribute: Array, *, axis: int) -> Array:
     wide = [1] * attribute.ndim
     wide[axis] = corner.shape[1]
     floating = jnp.issubdtype(attribute.dtype, jnp.inexact)
@@ -95,7 +95,7 @@ def _carried(corner: Array, weight: Array, attribute: Array, *, axis: int) -> Ar
 
 @jit
 def _frames(corner: Array, weight: Array, frame: Array, normal: Array | None) -> Array:
-    rows = _carried(corner, weight, frame[:, ::2].reshape(len(frame), 6), axis=0)
+    rows = _carry(corner, weight, frame[:, ::2].reshape(len(frame), 6), axis=0)
     return directions.frame(directions.normalize(rows[:, 3:]) if normal is None else normal.T, rows[:, :3])
 
 

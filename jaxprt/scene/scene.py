@@ -189,7 +189,7 @@ def _tuple(items: Any) -> tuple:
     return tuple(items)
 
 
-def _aligned(parts: Any) -> tuple:
+def _align_parts(parts: Any) -> tuple:
     """Parts whose meshes have one origin. Values that are not parts pass; the scene refuses them."""
     parts = _tuple(parts)
     if not all(isinstance(part, Part) for part in parts):
@@ -219,7 +219,7 @@ class Scene(eqx.Module):
         ValueError: There are no parts, or two parts or point lights have the same name.
     """
 
-    parts: tuple[Part, ...] = eqx.field(converter=_aligned)
+    parts: tuple[Part, ...] = eqx.field(converter=_align_parts)
     cameras: tuple[Camera, ...] = eqx.field(converter=_tuple, default=())
     environments: tuple[Environment, ...] = eqx.field(converter=_tuple, default=())
     point_lights: tuple[PointLight, ...] = eqx.field(converter=_tuple, default=())
@@ -291,7 +291,7 @@ def default_camera(scene: Scene, mesh: Mesh) -> Camera:
     return scene.cameras[0] if scene.cameras else orbit(mesh, azimuth=0.5, elevation=0.3)
 
 
-def numbered(names: Sequence[str]) -> list[str]:
+def unique_names(names: Sequence[str]) -> list[str]:
     """Makes names unique by appending numbers to repeated ones: "wood", "wood 2", "wood 3"."""
     taken: set[str] = set()
     latest: dict[str, int] = {}  # the number that each name got last, because counting anew takes quadratic time

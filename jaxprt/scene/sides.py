@@ -45,8 +45,8 @@ def with_copies(scene: Scene) -> tuple[Scene, tuple[Int[np.ndarray, " _"], ...]]
     lit = [isinstance(part.material, TexturedMaterial) and part.material.back == "lit" for part in scene.parts]
     if not any(lit):
         return scene, (none,) * len(lit)
-    rows = zip(scene.parts, _seen_backs(centered(scene)), lit, strict=True)
-    parts, copied = zip(*(_doubled(part, face) if wanted else (part, none) for part, face, wanted in rows), strict=True)
+    rows = zip(scene.parts, _visible_backs(centered(scene)), lit, strict=True)
+    parts, copied = zip(*(_double(part, face) if wanted else (part, none) for part, face, wanted in rows), strict=True)
     return dataclasses.replace(scene, parts=list(parts)), copied
 
 
@@ -57,7 +57,7 @@ def hidden_backs(scene: Scene) -> Bool[np.ndarray, " n"]:
     )
 
 
-def _seen_backs(scene: Scene) -> list[Bool[np.ndarray, " f"]]:
+def _visible_backs(scene: Scene) -> list[Bool[np.ndarray, " f"]]:
     """Whether something may see the back of each face, for each part."""
     mesh = scene.mesh
     face, position = np.asarray(mesh.face), np.asarray(mesh.position, np.float64)
@@ -65,7 +65,7 @@ def _seen_backs(scene: Scene) -> list[Bool[np.ndarray, " f"]]:
     piece = _pieces(corner)
     clear = np.zeros(len(position)) if mesh.opacity is None else np.asarray(mesh.opacity.layer) > 0
     pierced = np.bincount(piece, clear[face[:, 0]]) > 0
-    closed = _closed(corner, piece) & ~pierced & (_volumes(position[face], piece) > 0)
+    closed = _is_closed(corner, piece) & ~pierced & (_volumes(position[face], piece) > 0)
     for camera in scene.cameras:
         closed &= _windings(position[face], piece, np.asarray(camera.eye, np.float64)) < _INSIDE
     seen = ~closed[piece] & ~_has_twin(corner)
@@ -81,7 +81,7 @@ def _pieces(corner: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " f"]:
     return np.unique(label[corner[:, 0]], return_inverse=True)[1].reshape(-1)
 
 
-def _closed(corner: Int[np.ndarray, "f 3"], piece: Int[np.ndarray, " f"]) -> Bool[np.ndarray, " n"]:
+def _is_closed(corner: Int[np.ndarray, "f 3"], piece: Int[np.ndarray, " f"]) -> Bool[np.ndarray, " n"]:
     """Whether each piece is closed and consistently oriented: its faces run along each edge equally often both ways."""
     count = int(corner.max()) + 1
     start, end = corner.astype(np.int64), np.roll(corner, -1, 1).astype(np.int64)
@@ -131,7 +131,7 @@ def _has_twin(corner: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
     return sides[number.reshape(-1), 1 - odd.astype(int)]
 
 
-def _doubled(part: Part, copied: Bool[np.ndarray, " f"]) -> tuple[Part, Int[np.ndarray, " _"]]:
+def _double(part: Part, copied: Bool[np.ndarray, " f"]) -> tuple[Part, Int[np.ndarray, " _"]]:
     """The part with reversed copies of some faces, and the vertices that were copied.
 
     The frame of a copy is the opposite of that of its face.

@@ -196,7 +196,7 @@ def subdivide(mesh: Mesh, divisions: Sequence[Division]) -> Mesh:
     interpolated in the same way as for shading and normalized; tangents are made orthogonal to them. An added vertex
     gets the region of the first of the two vertices between which it lies. Existing vertices do not change.
     """
-    return _subdivided(mesh, [division.parent for division in divisions], divisions[-1].face) if divisions else mesh
+    return _subdivide_mesh(mesh, [division.parent for division in divisions], divisions[-1].face) if divisions else mesh
 
 
 def subdivide_scene(scene: Scene, divisions: Sequence[Division]) -> Scene:
@@ -220,7 +220,7 @@ def subdivide_scene(scene: Scene, divisions: Sequence[Division]) -> Scene:
     parents, owner, number = _of_parts(counts, [division.parent for division in divisions])
     face = divisions[-1].face
     faces = [number[face[owner[face[:, 0]] == part]] for part in range(len(counts))]
-    parts = [_subdivided_part(*row) for row in zip(scene.parts, parents, faces, strict=True)]
+    parts = [_subdivide_part(*row) for row in zip(scene.parts, parents, faces, strict=True)]
     return dataclasses.replace(scene, parts=parts)
 
 
@@ -285,7 +285,7 @@ def divide(scene: Scene, *, edge: float) -> Scene:
         position = np.concatenate([position, middle(position, divisions[-1].parent)])
 
 
-def _subdivided(mesh: Mesh, parents: Sequence[np.ndarray], face: np.ndarray) -> Mesh:
+def _subdivide_mesh(mesh: Mesh, parents: Sequence[np.ndarray], face: np.ndarray) -> Mesh:
     """The mesh with added vertices, each between two earlier ones."""
     triangle = jax.device_put(face.astype(np.asarray(mesh.face).dtype))
     if not any(len(parent) for parent in parents):
@@ -307,14 +307,14 @@ def _subdivided(mesh: Mesh, parents: Sequence[np.ndarray], face: np.ndarray) -> 
     return Mesh(jax.device_put(position), triangle, *frame, region, texture, mesh.origin)
 
 
-def _subdivided_part(part: Part, parents: Sequence[np.ndarray], face: np.ndarray) -> Part:
+def _subdivide_part(part: Part, parents: Sequence[np.ndarray], face: np.ndarray) -> Part:
     """The part with added vertices, each between two earlier ones."""
     color, second, alpha = (
         None if attribute is None else jax.device_put(spread(attribute, parents))
         for attribute in (part.color, part.second, part.alpha)
     )
     handedness = None if part.handedness is None else jax.device_put(_first(part.handedness, parents))
-    return Part(part.name, _subdivided(part.mesh, parents, face), part.material, color, second, handedness, alpha)
+    return Part(part.name, _subdivide_mesh(part.mesh, parents, face), part.material, color, second, handedness, alpha)
 
 
 def spread(value: Any, parents: Sequence[np.ndarray]) -> Any:

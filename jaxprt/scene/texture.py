@@ -35,11 +35,11 @@ def mipmap(image: Float[Array | np.ndarray, "h w c"]) -> list[Any]:
     """
     result: list[Any] = [image if isinstance(image, Tracer) else np.asarray(image)]
     while max(result[-1].shape[:2]) > 1:
-        result.append(_halved(_halved(result[-1], 0), 1))
+        result.append(_halve(_halve(result[-1], 0), 1))
     return result
 
 
-def _halved(image: Any, axis: int) -> Any:
+def _halve(image: Any, axis: int) -> Any:
     size = image.shape[axis]
     count = -(-size // 2)
     if size == 2 * count:
@@ -106,8 +106,8 @@ def bilinear(
     """Row, column and weight of the four texels around each coordinate, in an image of a given height and width."""
     height, width = shape
     # Reduced to one period first, because large coordinates times the width would lose precision.
-    x = _reduced(coordinate[..., 0], wrap[0]) * width - 0.5
-    y = (1 - _reduced(coordinate[..., 1], wrap[1])) * height - 0.5
+    x = _wrap(coordinate[..., 0], wrap[0]) * width - 0.5
+    y = (1 - _wrap(coordinate[..., 1], wrap[1])) * height - 0.5
     column, row = jnp.floor(x), jnp.floor(y)
     right, down = x - column, y - row
     result = []
@@ -118,7 +118,7 @@ def bilinear(
     return result
 
 
-def _reduced(place: Float[Array, "*b"], wrap: str) -> Float[Array, "*b"]:
+def _wrap(place: Float[Array, "*b"], wrap: str) -> Float[Array, "*b"]:
     """Coordinates reduced to one period: the image, or the image followed by its mirror image."""
     if wrap == "clamp":
         return jnp.clip(place, 0, 1)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxprt import require
-from jaxprt.image.tonemap import toned
+from jaxprt.image.tonemap import apply_curve
 
 MOST_BYTES = 1 << 29  # largest message, such as one with an environment map
 _MOST_JSON = 1 << 24  # bytes of the JSON of a message; it takes many times its size in memory
@@ -79,10 +79,10 @@ def look(message: Mapping[str, Any], *, systems: Sequence[str], lights: int) -> 
     """
     system = message.get("system")
     if not isinstance(system, str) or system not in systems:
-        raise ValueError(f"the system must be one of {', '.join(systems)}, got {_shown(system)}")
+        raise ValueError(f"the system must be one of {', '.join(systems)}, got {_shorten(system)}")
     light = message.get("light")
     if type(light) is not int or not 0 <= light < lights:
-        raise ValueError(f"the light must be a number from 0 to {lights - 1}, got {_shown(light)}")
+        raise ValueError(f"the light must be a number from 0 to {lights - 1}, got {_shorten(light)}")
     eye, target = (numbers(message, name, 3) for name in ("eye", "target"))
     if eye == target:
         raise ValueError(f"eye and target must be different points, got {list(eye)} for both")
@@ -108,7 +108,7 @@ def number(message: Mapping[str, Any], name: str, low: float, high: float) -> fl
     value = message.get(name)
     large = isinstance(value, int) and abs(value) >= _LARGEST_INTEGER  # float() would raise OverflowError
     if isinstance(value, bool) or not isinstance(value, int | float) or large or not math.isfinite(value):
-        raise ValueError(f"{name} must be a finite number, got {_shown(value)}")
+        raise ValueError(f"{name} must be a finite number, got {_shorten(value)}")
     if not low <= value <= high:
         raise ValueError(f"{name} must be from {low:g} to {high:g}, got {value:g}")
     return float(value)
@@ -122,7 +122,7 @@ def truth(message: Mapping[str, Any], name: str) -> bool:
     """
     value = message.get(name, False)
     if not isinstance(value, bool):
-        raise ValueError(f"{name} must be true or false, got {_shown(value)}")
+        raise ValueError(f"{name} must be true or false, got {_shorten(value)}")
     return value
 
 
@@ -134,11 +134,11 @@ def text(message: Mapping[str, Any], name: str) -> str:
     """
     value = message.get(name, "")
     if not isinstance(value, str):
-        raise ValueError(f"{name} must be text, got {_shown(value)}")
+        raise ValueError(f"{name} must be text, got {_shorten(value)}")
     return value
 
 
-def _shown(value: Any) -> str:
+def _shorten(value: Any) -> str:
     """A value in an error message, cut off where it is long."""
     if isinstance(value, int) and abs(value) >= _LARGEST_INTEGER:
         return f"an integer of {value.bit_length()} bits"
@@ -235,7 +235,7 @@ def encode(color: ArrayLike, *, stops: float | None, tone: str = "srgb") -> tupl
     if stops is None:
         scale = max(1.0, float(np.max(np.abs(value), initial=0.0)) / _LARGEST_HALF)
         return np.clip(value / np.float32(scale), -_LARGEST_HALF, _LARGEST_HALF).astype("<f2").tobytes(), scale
-    exposed = toned(value * np.float32(2.0**stops), tone, np)
+    exposed = apply_curve(value * np.float32(2.0**stops), tone, np)
     display = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * exposed ** (1 / 2.4) - 0.055)
     level = np.round(255 * display).astype(np.uint8)
     # Differences between successive entries of a channel compress better, because neighbors are similar.
@@ -246,7 +246,7 @@ def encode(color: ArrayLike, *, stops: float | None, tone: str = "srgb") -> tupl
 def _items(message: Mapping[str, Any], name: str) -> Sequence[Any]:
     value = message.get(name, [])
     if not isinstance(value, list | tuple):
-        raise ValueError(f"{name} must be a list, got {_shown(value)}")
+        raise ValueError(f"{name} must be a list, got {_shorten(value)}")
     return value
 
 
@@ -259,7 +259,7 @@ def _lamps(message: Mapping[str, Any]) -> tuple[Lamp, ...]:
 
 def _lamp(message: Any) -> Lamp:
     if not isinstance(message, Mapping):
-        raise ValueError(f"a lamp must have a direction, an angle and a radiance, got {_shown(message)}")
+        raise ValueError(f"a lamp must have a direction, an angle and a radiance, got {_shorten(message)}")
     direction = numbers(message, "direction", 3)
     if not 1e-6 < math.hypot(*direction) < 1e6:
         raise ValueError(f"the direction of a lamp must have a length between 1e-6 and 1e6, got {list(direction)}")
@@ -268,15 +268,15 @@ def _lamp(message: Any) -> Lamp:
 
 def _materials(message: Any) -> tuple[tuple[str, tuple[tuple[str, Any], ...]], ...]:
     if not isinstance(message, Mapping):
-        raise ValueError(f"materials must be a dictionary from names of parts, got {_shown(message)}")
+        raise ValueError(f"materials must be a dictionary from names of parts, got {_shorten(message)}")
     return tuple(sorted((str(name), _material(name, value)) for name, value in message.items()))
 
 
 def _material(part: str, message: Any) -> tuple[tuple[str, Any], ...]:
     if not isinstance(message, Mapping) or not set(message) <= set(MATERIAL):
         raise ValueError(
-            f"the material of part {_shown(part)} must be a dictionary with keys among {', '.join(MATERIAL)}, got "
-            f"{', '.join(map(_shown, message)) if isinstance(message, Mapping) else _shown(message)}"
+            f"the material of part {_shorten(part)} must be a dictionary with keys among {', '.join(MATERIAL)}, got "
+            f"{', '.join(map(_shorten, message)) if isinstance(message, Mapping) else _shorten(message)}"
         )
     result = []
     for name in sorted(message):

@@ -46,10 +46,14 @@ def content(reduced: RelitScene, level: int) -> tuple[dict[str, Any], list[bytes
     arrays: list[list[np.ndarray]] = [[] for _ in range(6)]
     for number, (part, system, vector) in enumerate(zip(reduced.scene.parts, systems, vectors, strict=True)):
         shading, (start, table) = reduced.shading[number], tables.add(part.name, system)
-        weight, seen, described = _weights(shading, system), _means(system, level), _described(part.material, shading)
+        weight, seen, described = (
+            _weights(shading, system),
+            _means(system, level),
+            _material_json(part.material, shading),
+        )
         words = None if bits is None else bits[number]
         bit = np.zeros((0, 0), np.uint8) if words is None else words
-        about = _about(system) | {"family": _family(shading), "texels": bool(bit.size)}
+        about = _system_json(system) | {"family": _family(shading), "texels": bool(bit.size)}
         about |= {"name": part.name, "count": vector.shape[1], "channels": weight.shape[1] - 1}
         about |= {"nodes": table.shape[1], "entries": table.shape[2], "terms": -(-len(vector) // 4) * 4}
         about |= {"weightStep": 0 if described else weight.shape[1], **(described or {})}
@@ -106,7 +110,7 @@ def _key(system: Exported) -> Any:
     return kind, *((np.shape(leaf), np.asarray(leaf).tobytes()) for leaf in leaves)
 
 
-def _about(system: Exported) -> dict[str, Any]:
+def _system_json(system: Exported) -> dict[str, Any]:
     """JSON description of a part's system for the page's module."""
     about = {"lobes": 0, "bands": 0, "words": 0, "steps": 0.0, "knot": [], "laplacian": 1.0}
     if isinstance(system, lobe.LobeSystem):
@@ -147,7 +151,7 @@ def mips(size: int) -> list[int]:
     return result
 
 
-def blurring(size: int) -> dict[str, Any]:
+def blur_parameters(size: int) -> dict[str, Any]:
     """Parameters for blurring the light to all lobe widths, as `jaxprt.systems.lobe.blurred_light.prefilter` does."""
     scale = blurred_light.scales(size)
     pairs = zip(scale.edge.tolist(), scale.spread.tolist(), strict=True)
@@ -224,7 +228,7 @@ def _weights(shading: Shading, system: Exported) -> Float[np.ndarray, "v k 4"]:
     return result
 
 
-def _described(material: Any, shading: Shading) -> dict[str, Any] | None:
+def _material_json(material: Any, shading: Shading) -> dict[str, Any] | None:
     """Parameters of a material that is the same at all vertices; None for other materials."""
     if isinstance(material, BlinnPhong) and shading.table is standard.BLINN_PHONG:
         values = {

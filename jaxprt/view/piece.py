@@ -193,9 +193,9 @@ def _page(
     content, arrays = contents
     mips = parts.mips(next(iter(lights.values())).radiance.shape[-2])
     size = light_size(reduced)
-    blurring = parts.blurring(size) if size else parts.NO_SCALES
+    blurring = parts.blur_parameters(size) if size else parts.NO_SCALES
     free = [
-        part | {"free": _free(part["free"]) if "material" in entry else None}
+        part | {"free": _free_parameters(part["free"]) if "material" in entry else None}
         for part, entry in zip(reply.content["parts"], content["parts"], strict=True)
     ]
     head = reply.content | {
@@ -211,7 +211,7 @@ def _page(
         *reply.buffers,
         *arrays,
         *(cubemap.border_index(size=edge).astype("<u4").tobytes() for edge in rims),
-        *(_colored(light, mips[0]).astype("<f4").tobytes() for light in lights.values()),
+        *(_light_texels(light, mips[0]).astype("<f4").tobytes() for light in lights.values()),
         *(buffer for sky in skies if sky is not None for buffer in sky.buffers),
     ]
     data = base64.b64encode(zlib.compress(messages.pack(content, buffers), 6)).decode()
@@ -243,7 +243,7 @@ def _skies(session: Session, room: int | float) -> list[Reply | None]:
     return [None] * len(shown)
 
 
-def _free(free: dict[str, Any]) -> dict[str, Any]:
+def _free_parameters(free: dict[str, Any]) -> dict[str, Any]:
     """What users of the page can change of a part, of what they can change in the viewer."""
     result = dict(free)
     if "roughness" in free:
@@ -255,6 +255,6 @@ def _free(free: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _colored(light: Environment, size: int) -> Float[np.ndarray, "6 n n 3"]:
+def _light_texels(light: Environment, size: int) -> Float[np.ndarray, "6 n n 3"]:
     radiance = np.asarray(resized(light, size=size).radiance)
     return np.broadcast_to(radiance, (*radiance.shape[:-1], 3))

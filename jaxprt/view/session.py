@@ -79,7 +79,7 @@ class Session:
         for name, system in by_name.items():
             if [(part.name, part.mesh.position.shape) for part in system.scene.parts] != shape:
                 raise ValueError(f"systems must be of the same scene, got another scene for {name!r}")
-        lights = _named(lights_of(scene.scene)) if environments is None else dict(environments)
+        lights = _name_lights(lights_of(scene.scene)) if environments is None else dict(environments)
         _check_lights(lights)
         self.stages = Stages(by_name, lights)
         self._lock = threading.Lock()
@@ -283,7 +283,7 @@ def _size(message: Mapping[str, Any]) -> tuple[int, int, bool]:
     return max(width // step, 1), max(height // step, 1), coarse
 
 
-def _named(lights: Sequence[Environment]) -> dict[str, Environment]:
+def _name_lights(lights: Sequence[Environment]) -> dict[str, Environment]:
     return {f"light {number}": light for number, light in enumerate(lights, 1)}
 
 

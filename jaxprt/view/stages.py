@@ -93,7 +93,9 @@ class Stages:
         unknown = [name for name, _ in look.material if name not in parts]
         if unknown:
             raise ValueError(f"materials must be for the parts {', '.join(parts)}, got one for {unknown[0]!r}")
-        return {name: changed(parts[name].material, name, dict(values)) for name, values in look.material if values}
+        return {
+            name: change_material(parts[name].material, name, dict(values)) for name, values in look.material if values
+        }
 
     def appearances(self, look: Look) -> dict[str, Appearance]:
         """The changed materials of a look, evaluated at the vertices."""
@@ -235,7 +237,7 @@ def freedom(shading: Shading, material: Any) -> dict[str, Any] | None:
     return free
 
 
-def changed(material: Any, name: str, values: Mapping[str, Any]) -> TexturedMaterial | BlinnPhong:
+def change_material(material: Any, name: str, values: Mapping[str, Any]) -> TexturedMaterial | BlinnPhong:
     """The material with other values of roughness, reflectance and colors.
 
     Raises:
@@ -244,7 +246,7 @@ def changed(material: Any, name: str, values: Mapping[str, Any]) -> TexturedMate
     if isinstance(material, BlinnPhong):
         new = {key: jnp.asarray(values[key]) for key in ("diffuse", "exponent") if key in values}
         if "f0" in values or "specular" in values:
-            new["specular"] = _tinted(material.specular, 1.0, values)
+            new["specular"] = _tint(material.specular, 1.0, values)
         return dataclasses.replace(material, **new)
     if not isinstance(material, TexturedMaterial):
         raise ValueError(f"the material of part {name!r} is a BRDF, which cannot change in the viewer")
@@ -254,11 +256,11 @@ def changed(material: Any, name: str, values: Mapping[str, Any]) -> TexturedMate
     if "diffuse" in values:
         new["base_color"] = jnp.asarray(values["diffuse"])
     if "f0" in values or "specular" in values:
-        new["specular_color"] = _tinted(material.specular_color, _f0(material), values)
+        new["specular_color"] = _tint(material.specular_color, _f0(material), values)
     return dataclasses.replace(material, **new)
 
 
-def _tinted(color: Any, white: float, values: Mapping[str, Any]) -> Float[Array, "3"]:
+def _tint(color: Any, white: float, values: Mapping[str, Any]) -> Float[Array, "3"]:
     """A specular color with another strength or tint. A strength of 1 has the reflectance `white`."""
     old = np.broadcast_to(np.asarray(color), (3,))
     strength = values["f0"] / white if "f0" in values else float(old.max())

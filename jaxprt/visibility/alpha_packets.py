@@ -79,13 +79,13 @@ class AlphaPackets:
     ) -> Float32[np.ndarray, " n"]:
         """Share of light that passes along each ray. `Occluder.blocked` explains the arguments."""
         share = np.ones(len(point), np.float32)
-        _passed(self._occluded, self._scene, origin, direction, point, way, share)
+        _trace_shares(self._occluded, self._scene, origin, direction, point, way, share)
         return share
 
     def blocked(self, origin, direction, point, way) -> Bool[np.ndarray, " n"]:
         """Whether each ray is stopped: with the probability that its light is, by a hash of the ray."""
         share = self.passed(origin, direction, point, way)
-        return _stopped(origin, direction, point, way, share)
+        return _trace_blocked(origin, direction, point, way, share)
 
     @property
     def query(self) -> tuple[int, int, np.ndarray, np.ndarray, np.ndarray]:
@@ -134,7 +134,7 @@ class AlphaPackets:
         count, shape = np.zeros(len(direction), np.int32), (len(direction), _ROOM)
         place, face = np.full(shape, np.inf, np.float32), np.zeros(shape, np.int64)
         alpha, skipped = np.zeros(shape, np.float32), np.ascontiguousarray(hidden[self._clear], np.uint8)
-        _collected(self._intersect, self._scene, origin, direction, far, skipped, count, place, face, alpha)
+        _collect(self._intersect, self._scene, origin, direction, far, skipped, count, place, face, alpha)
         return count, self._clear[face], place, alpha
 
 
@@ -190,7 +190,7 @@ def _texel_index(index, size, mode):
 
 @no_type_check
 @numba.njit(inline="always")
-def _reduced(place, mode):
+def _wrap(place, mode):
     """A coordinate within the first period of its wrap mode."""
     if mode == _CLAMP:
         return min(max(place, np.float32(0)), np.float32(1))
@@ -214,8 +214,8 @@ def _alpha(table, face, u, v):
         shape = carray(_pointer(table[6] + 8 * layer), 2, np.int32)
         height, width = shape[0], shape[1]
         texel = carray(_pointer(table[7] + 4 * start), height * width, np.float32)
-        across = _reduced(w * coordinate[0] + u * coordinate[2] + v * coordinate[4], wrap[0])
-        up = _reduced(w * coordinate[1] + u * coordinate[3] + v * coordinate[5], wrap[1])
+        across = _wrap(w * coordinate[0] + u * coordinate[2] + v * coordinate[4], wrap[0])
+        up = _wrap(w * coordinate[1] + u * coordinate[3] + v * coordinate[5], wrap[1])
         x, y = across * width - np.float32(0.5), (np.float32(1) - up) * height - np.float32(0.5)
         left, top = int(np.floor(x)), int(np.floor(y))
         right, down = x - np.float32(left), y - np.float32(top)
@@ -234,7 +234,7 @@ def _alpha(table, face, u, v):
 
 @no_type_check
 @numba.njit(inline="always")
-def _mixed(state, value):
+def _mix_bits(state, value):
     """A step of a hash of 32-bit integers."""
     state = np.uint32(state ^ value) * np.uint32(0x85EBCA6B)
     state ^= state >> np.uint32(13)
@@ -280,7 +280,7 @@ def _veil(argument):
         elif mode == _FIRST:
             state = np.uint32(face)
             for row in (0, 1, 2, 4, 5, 6):
-                state = _mixed(state, number[row * n + lane])
+                state = _mix_bits(state, number[row * n + lane])
             if _fraction(state) >= alpha:
                 valid[lane] = 0
         elif alpha < 1:
@@ -340,7 +340,7 @@ def _no_hit(ray):
 
 @no_type_check
 @packets.compiled
-def _passed(address, scene, origin, direction, point, way, share):
+def _trace_shares(address, scene, origin, direction, point, way, share):
     context, arguments = np.empty(16, np.int64), np.empty(4, np.int64)
     _empty_context(context, arguments, _PASSED)
     context[_FIELD] = share.ctypes.data
@@ -362,7 +362,7 @@ def _passed(address, scene, origin, direction, point, way, share):
 
 @no_type_check
 @packets.compiled
-def _stopped(origin, direction, point, way, share):
+def _trace_blocked(origin, direction, point, way, share):
     result = np.empty(len(point), np.bool_)
     for at in range(len(point)):
         if share[at] == 0 or share[at] == 1:
@@ -372,7 +372,7 @@ def _stopped(origin, direction, point, way, share):
         for axis in range(3):
             bits[axis], bits[3 + axis] = origin[point[at], axis], direction[way[at], axis]
         for value in bits.view(np.uint32):
-            state = _mixed(state, value)
+            state = _mix_bits(state, value)
         result[at] = _fraction(state) >= share[at]
     return result
 
@@ -406,7 +406,7 @@ def _first(address, scene, origin, direction, face, part, distance, weight):
 
 @no_type_check
 @packets.compiled
-def _collected(address, scene, origin, direction, far, hidden, count, place, face, alpha):
+def _collect(address, scene, origin, direction, far, hidden, count, place, face, alpha):
     context, arguments = np.empty(16, np.int64), np.empty(4, np.int64)
     _empty_context(context, arguments, _LAYERS)
     context[_FIELD], context[_FIELD + 1] = count.ctypes.data, place.ctypes.data

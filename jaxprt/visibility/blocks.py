@@ -143,18 +143,18 @@ def compute(
     total = sum(_count(job, block) for block in chosen)
     with tqdm.tqdm(total=total, desc=label, unit="vertex", unit_scale=True, disable=not progress) as bar:
         if store is None:
-            memory = _Kept(job, counts)
+            memory = _Memory(job, counts)
             _run(job, chosen, memory.place, None, executor, bar)
             return memory.array
-        todo = _missing(store, chosen)
+        todo = _missing_blocks(store, chosen)
         bar.update(total - sum(_count(job, block) for block in todo))
         if todo:
             with store.writing((1, 1) if part is None else (part.number, part.count)):
                 # Another process may have finished some blocks before this one acquired the lock.
-                _run(job, _missing(store, todo), store.write, store, executor, bar)
+                _run(job, _missing_blocks(store, todo), store.write, store, executor, bar)
         bar.update(bar.total - bar.n)
     if part is not None:
-        left = int(np.sum(~store.written())) or len(_missing(store, set(range(blocks)) - set(chosen)))
+        left = int(np.sum(~store.written())) or len(_missing_blocks(store, set(range(blocks)) - set(chosen)))
         if left:
             raise UnfinishedError(
                 f"part {part.number}/{part.count} of {store.path} is done; {left} of its {blocks} blocks are missing: "
@@ -178,7 +178,7 @@ def _check_context(executor: Executor | None) -> None:
         )
 
 
-class _Kept:
+class _Memory:
     """Results that are held in memory only, without a store.
 
     Attributes:
@@ -337,7 +337,7 @@ def _ahead(job: Job, here: bool) -> int:
     return 2 * cores() if here else max(2 * cores(), min(_HELD // max(1, size), _MOST))
 
 
-def _missing(store: BlockStore, blocks: Iterable[int]) -> list[int]:
+def _missing_blocks(store: BlockStore, blocks: Iterable[int]) -> list[int]:
     """The blocks that are missing from the store. All cores check checksums."""
     written = store.written()
     with ThreadPoolExecutor(cores()) as pool:

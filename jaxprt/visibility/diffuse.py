@@ -10,7 +10,7 @@ from jaxprt.scene import subdivision
 from jaxprt.scene.light_samples import LightSamples
 from jaxprt.scene.mesh import Mesh
 from jaxprt.visibility.occluder import Occluder, offsets
-from jaxprt.visibility.starts import inside, start_points, starts_and_buried
+from jaxprt.visibility.starts import inside, start_points, start_points_and_buried
 
 _RAYS = 1 << 17  # rays per call, so that they fit in a core's cache
 
@@ -89,7 +89,7 @@ class DiffuseTracer:
         place, face = (
             np.concatenate(pair) for pair in ((other.position, position), (other.face, casting + len(other.position)))
         )
-        start, buried = starts_and_buried(mesh, Occluder(_mesh(place, face)), offset=offset)
+        start, buried = start_points_and_buried(mesh, Occluder(_mesh(place, face)), offset=offset)
         rows = index[around.size :]
         return self._light(start[rows], normal[vertex]), buried[rows]
 

@@ -99,7 +99,7 @@ class Packets:
     ) -> Bool[np.ndarray, " n"]:
         """Whether each ray hits a triangle. `Occluder.blocked` explains the arguments."""
         result = np.empty(len(point), np.bool_)
-        _blocked(self._occluded, self._scene, self._arguments.ctypes.data, origin, direction, point, way, result)
+        _trace_blocked(self._occluded, self._scene, self._arguments.ctypes.data, origin, direction, point, way, result)
         return result
 
 
@@ -260,7 +260,7 @@ def ray_buffers(rows):
 
 @no_type_check
 @compiled
-def _blocked(address, scene, arguments, origin, direction, point, way, result):
+def _trace_blocked(address, scene, arguments, origin, direction, point, way, result):
     ray, valid = ray_buffers(12)
     for packet in range(0, len(point), 16):
         count = min(16, len(point) - packet)
@@ -288,8 +288,8 @@ def start(surface, points, point, lane, origin, facing):
     number = max(triangle[point], 0)
     a, b, c = face[number, 0], face[number, 1], face[number, 2]
     # Arrays would be allocated for each point, which takes longer than the rays.
-    along = _between(position, a, b)
-    other = _between(position, a, c)
+    along = _edge_vector(position, a, b)
+    other = _edge_vector(position, a, c)
     across = (
         along[1] * other[2] - along[2] * other[1],
         along[2] * other[0] - along[0] * other[2],
@@ -316,7 +316,7 @@ def start(surface, points, point, lane, origin, facing):
 
 @no_type_check
 @compiled
-def _between(position, first, last):
+def _edge_vector(position, first, last):
     """The vector from one vertex to another in float64."""
     return (
         np.float64(position[last, 0]) - np.float64(position[first, 0]),

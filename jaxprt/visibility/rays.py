@@ -138,7 +138,7 @@ def exhaustive(
     return seen
 
 
-def chosen(mesh: Mesh, vertex: np.ndarray | None) -> np.ndarray:
+def vertex_indices(mesh: Mesh, vertex: np.ndarray | None) -> np.ndarray:
     """Indices of the vertices to light: all for None, the set entries of a mask, or the given indices.
 
     Raises:
@@ -160,8 +160,8 @@ def chosen(mesh: Mesh, vertex: np.ndarray | None) -> np.ndarray:
 
 
 def place(mesh: Mesh, vertex: np.ndarray | None) -> Float[Array, "v 3"]:
-    """Positions of the vertices to light; see `chosen`."""
-    return jax.device_put(np.asarray(mesh.position)[chosen(mesh, vertex)])
+    """Positions of the vertices to light; see `vertex_indices`."""
+    return jax.device_put(np.asarray(mesh.position)[vertex_indices(mesh, vertex)])
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,7 @@ class VisibilityJob(blocks.Job):
                 "takes scenes and the coordinates of their files",
                 stacklevel=4,
             )
-        vertex = chosen(mesh, vertex)
+        vertex = vertex_indices(mesh, vertex)
         occluder_rays = Occluder(shadowing)
         start = start_points(mesh, occluder_rays, apart=apart)[vertex]
         normal, tangent = (np.asarray(vector)[vertex] for vector in (mesh.normal, mesh.tangent))
@@ -288,8 +288,8 @@ def _trace(occluder: Occluder, start: np.ndarray, above: np.ndarray, seen: np.nd
     place = vertex * above.shape[1] + texel
     if occluder.blends:
         share = occluder.passed(start, table.center, vertex, texel)
-        flat[place] = _rounded(LEVELS * share, vertex, texel)
-        mixed = np.flatnonzero(_uneven(seen, table.border).reshape(-1)[place])
+        flat[place] = _dither(LEVELS * share, vertex, texel)
+        mixed = np.flatnonzero(_varying_texels(seen, table.border).reshape(-1)[place])
     else:
         flat[place] = ~occluder.blocked(start, table.center, vertex, texel)
         mixed = np.flatnonzero(_boundary(seen, table.border).reshape(-1)[place])
@@ -304,7 +304,7 @@ def _boundary(clear: np.ndarray, border: np.ndarray) -> np.ndarray:
     return (_dilate(padded) & _dilate(1 - padded)).astype(bool)
 
 
-def _rounded(value: np.ndarray, vertex: np.ndarray, texel: np.ndarray) -> np.ndarray:
+def _dither(value: np.ndarray, vertex: np.ndarray, texel: np.ndarray) -> np.ndarray:
     """Whole numbers whose mean over neighboring texels is that of the values, by ordered dithering.
 
     Rounding to the nearest would change the share that all texels behind one translucent surface have, by up to 1/32.
@@ -312,7 +312,7 @@ def _rounded(value: np.ndarray, vertex: np.ndarray, texel: np.ndarray) -> np.nda
     return np.floor(value + (_KRONECKER[0] * texel + _KRONECKER[1] * vertex) % 1)
 
 
-def _uneven(seen: np.ndarray, border: np.ndarray) -> np.ndarray:
+def _varying_texels(seen: np.ndarray, border: np.ndarray) -> np.ndarray:
     """Texels in whose 3 x 3 neighborhood visibility, in sixteenths, differs by more than an eighth."""
     padded = seen.take(border.reshape(-1), axis=1).reshape(-1, *border.shape)
     rows = [(padded[..., :-2, :], padded[..., 1:-1, :], padded[..., 2:, :]) for _ in range(2)]
@@ -337,7 +337,7 @@ def _supersample(occluder, start, vertex, texel, table) -> np.ndarray:
         way = (LEVELS * texel[part, None] + np.arange(LEVELS)).reshape(-1)
         if occluder.blends:
             share = occluder.passed(start, table.fine, np.repeat(vertex[part], LEVELS), way).reshape(-1, LEVELS)
-            out[part] = _rounded(share.sum(1), vertex[part], texel[part])
+            out[part] = _dither(share.sum(1), vertex[part], texel[part])
             continue
         shadow = occluder.blocked(start, table.fine, np.repeat(vertex[part], LEVELS), way)
         out[part] = LEVELS - shadow.reshape(-1, LEVELS).sum(1, dtype=np.uint8)

@@ -192,7 +192,7 @@ def divisions(
         ThreadPoolExecutor(blocks.cores()) as pool,
         tqdm.tqdm(desc="refine", unit="vertex", unit_scale=True, disable=not progress) as bar,
     ):
-        surface = _Surface(mesh, DiffuseTracer(mesh, occluder, samples, pool), points, _seen(mesh, views))
+        surface = _Surface(mesh, DiffuseTracer(mesh, occluder, samples, pool), points, _visible_places(mesh, views))
         while True:
             count, squares = len(surface.position), surface.squares()
             left = float(squares.sum(0).max()) ** 0.5
@@ -201,7 +201,7 @@ def divisions(
             if left <= error:
                 return result, left
             edges = Edges(surface.position, surface.face)
-            marked = _marked(surface, edges, squares, error, vertices - count)
+            marked = _edges_to_cut(surface, edges, squares, error, vertices - count)
             if not marked.any():
                 break
             result.append(edges.divide(marked))
@@ -224,11 +224,11 @@ def interpolation_error(mesh: Mesh, *, views: Sequence[Camera]) -> float:
     """
     samples, points = light_samples.natural(size=_SIZE, degree=_DEGREE), round(_HIDDEN * _FINEST**-2)
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(blocks.cores()) as pool:
-        surface = _Surface(mesh, DiffuseTracer(mesh, mesh, samples, pool), points, _seen(mesh, views))
+        surface = _Surface(mesh, DiffuseTracer(mesh, mesh, samples, pool), points, _visible_places(mesh, views))
         return float(surface.squares().sum(0).max()) ** 0.5
 
 
-def _seen(mesh: Mesh, views: Sequence[Camera]) -> tuple[subdivision.Points, Float[np.ndarray, " p"]]:
+def _visible_places(mesh: Mesh, views: Sequence[Camera]) -> tuple[subdivision.Points, Float[np.ndarray, " p"]]:
     return places(mesh, Occluder(mesh), views)
 
 
@@ -283,7 +283,7 @@ class _Surface:
 
     def differences(self, face: Int[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 l c"]:
         """Radiance at the midpoints of edges, minus the mean of their endpoints; 0 inside of solids."""
-        ends = _ends(face)
+        ends = _edge_ends(face)
         middle = np.searchsorted(self._key, _key(ends))
         apart = self._middle[middle] - self.light[ends].mean(2)
         apart[self._buried[middle]] = 0
@@ -350,7 +350,7 @@ class _Surface:
 
     def _trace_middles(self, changed: Int[np.ndarray, " n"]) -> None:
         """Traces rays at those midpoints of some triangles' edges whose radiance is not known."""
-        edge, middle = np.unique(_key(_ends(self.face[changed])), return_inverse=True)
+        edge, middle = np.unique(_key(_edge_ends(self.face[changed])), return_inverse=True)
         corner = np.concatenate([self.face[changed], len(self.position) + middle.reshape(-1, 3)], 1)
         smaller = corner[:, [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]].reshape(-1, 3)
         parent = np.stack(np.divmod(edge, 1 << 32), -1)
@@ -365,7 +365,7 @@ class _Surface:
         key, light = np.concatenate([self._key, edge[new]]), np.concatenate([self._middle, light])
         buried = np.concatenate([self._buried, buried])
         # Drop the edges that have been cut.
-        keep = np.flatnonzero(np.isin(key, _key(_ends(self.face))))
+        keep = np.flatnonzero(np.isin(key, _key(_edge_ends(self.face))))
         order = keep[np.argsort(key[keep])]
         self._key, self._middle, self._buried = key[order], light[order], buried[order]
 
@@ -417,7 +417,9 @@ class _Surface:
         return self._tracer.at_points(place + self.offset[triangle, None] * out, normal, out)
 
 
-def _marked(surface: _Surface, edges: Edges, squares: np.ndarray, error: float, room: int) -> Bool[np.ndarray, " e"]:
+def _edges_to_cut(
+    surface: _Surface, edges: Edges, squares: np.ndarray, error: float, room: int
+) -> Bool[np.ndarray, " e"]:
     """Edges to cut next: those of the triangles with the largest errors, within the allowed number of vertices."""
     total = squares.sum(0)
     unmet = total > error**2
@@ -445,7 +447,7 @@ def _marked(surface: _Surface, edges: Edges, squares: np.ndarray, error: float, 
     return closed(bisect.bisect_right(range(len(order) + 1), max(room, 0), key=needed) - 1)
 
 
-def _ends(face: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "f 3 2"]:
+def _edge_ends(face: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "f 3 2"]:
     """Indices of the endpoints of each triangle's edges, the lower index first."""
     return np.sort(np.stack([face, np.roll(face, -1, 1)], -1), -1)
 

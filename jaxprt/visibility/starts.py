@@ -55,7 +55,7 @@ def out_of_solids(
     buried = inside(occluder, start, out)
     if not buried.any():
         return start, buried
-    vertex, goal = _ways(mesh, start, buried)
+    vertex, goal = _escape_goals(mesh, start, buried)
     place, length = _outside(occluder, start[vertex], goal, out[vertex], offset[vertex, 0])
     reachable = np.flatnonzero(np.isfinite(length))
     reachable = reachable[np.lexsort((length[reachable], vertex[reachable]))]
@@ -71,7 +71,7 @@ def _normals(occluder: Occluder) -> Float32[np.ndarray, "f 3"]:
     return np.cross(b - a, c - a)
 
 
-def _hit(occluder: Occluder, start: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _first_front(occluder: Occluder, start: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The first triangle on each ray, -1 for none, and its distance. Of the two sides of a sheet no ray hits a back."""
     triangle, distance, weight = occluder.hit(start, way)
     hit = np.flatnonzero(triangle >= 0)
@@ -101,7 +101,7 @@ def inside(
     other = np.cross(out, side)
     for x, y, z in local:
         way = x * side[hidden] + y * other[hidden] + z * out[hidden]
-        triangle, distance = _hit(occluder, start[hidden], way)
+        triangle, distance = _first_front(occluder, start[hidden], way)
         back = np.sum(facing[triangle] * way, 1) > 0
         behind[hidden] += back & (triangle >= 0)
         if z > _STEEP:
@@ -114,7 +114,7 @@ def inside(
     return result
 
 
-def _ways(mesh: Mesh, start: np.ndarray, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _escape_goals(mesh: Mesh, start: np.ndarray, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """For each corner of a triangle at a vertex inside of a solid: the vertex, and three goals on the triangle."""
     face = np.asarray(mesh.face)
     vertices, goals = [], []
@@ -138,7 +138,7 @@ def _outside(
     reached = np.full(len(origin), np.inf, np.float32)
     active = np.flatnonzero(length > 4 * offset)
     for _ in range(_CROSSINGS):
-        triangle, distance = _hit(occluder, place[active], way[active])
+        triangle, distance = _first_front(occluder, place[active], way[active])
         step = distance + 2 * offset[active]
         on_way = (triangle >= 0) & (travelled[active] + step < length[active])
         active, step = active[on_way], step[on_way]
@@ -175,10 +175,10 @@ def start_points(
         ValueError: The mesh has no faces, a face refers to a missing vertex, or positions, normals or tangents are not
             finite.
     """
-    return starts_and_buried(mesh, occluder, offset=offset, apart=apart)[0]
+    return start_points_and_buried(mesh, occluder, offset=offset, apart=apart)[0]
 
 
-def starts_and_buried(
+def start_points_and_buried(
     mesh: Mesh, occluder: Occluder, *, offset: Float[np.ndarray, " f"] | None = None, apart: bool = False
 ) -> tuple[Float32[np.ndarray, "v 3"], Bool[np.ndarray, " v"]]:
     """The result of `start_points`, and whether each vertex lies inside of another solid."""
@@ -207,7 +207,7 @@ def _inward(position: np.ndarray, face: np.ndarray, out: np.ndarray) -> Float32[
     toward = position[face].mean(1)[:, None] - position[face]
     toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 1e-30)
     count = np.maximum(np.bincount(face.ravel(), minlength=len(position)), 1)[:, None]
-    mean = _added(face.ravel(), toward.reshape(-1, 3), len(position)) / count
+    mean = _sum_by_index(face.ravel(), toward.reshape(-1, 3), len(position)) / count
     # Faces that are not in one plane have no inside that is above all of them.
     flat = np.ones(len(position))
     np.minimum.at(
@@ -245,11 +245,11 @@ def _outward(mesh: Mesh, apart: bool) -> tuple[np.ndarray, np.ndarray]:
     sided = np.stack(
         [np.where(np.sum(facing * normal[corner], 1) < 0, -1.0, 1.0)[:, None] * facing for corner in face.T]
     )
-    of_vertex = _added(face.T.ravel(), sided.reshape(-1, 3), len(normal))
+    of_vertex = _sum_by_index(face.T.ravel(), sided.reshape(-1, 3), len(normal))
     _, place = np.unique(_rows(position), return_inverse=True)
     if apart:
         _, place = np.unique(place + len(position) * np.asarray(mesh.region, np.int64), return_inverse=True)
-    joint = _added(place, of_vertex, len(normal))[place]
+    joint = _sum_by_index(place, of_vertex, len(normal))[place]
     # The normals of the two sides of a sheet cancel; each vertex then uses its own faces only.
     shared = np.sum(joint * of_vertex, 1) > 1e-6 * np.sum(of_vertex * of_vertex, 1)
     total = np.where(shared[:, None], joint, of_vertex)
@@ -297,7 +297,7 @@ def _off_faces(out: np.ndarray, group: np.ndarray, facing: np.ndarray) -> tuple[
     return np.where(grazing, steepness, least), best
 
 
-def _added(index: np.ndarray, vector: np.ndarray, count: int) -> np.ndarray:
+def _sum_by_index(index: np.ndarray, vector: np.ndarray, count: int) -> np.ndarray:
     """Sums of vectors by index."""
     return np.stack([np.bincount(index, vector[:, axis], count) for axis in range(3)], 1)
 

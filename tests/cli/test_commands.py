@@ -174,7 +174,7 @@ def test_info_says_how_brdf_files_are_used(data, capsys):
 
 
 def test_lights_are_turned_counterclockwise_as_seen_from_above(place):
-    options = play.chosen([str(place / "sky.exr"), "--turn", "0,90", "--light-size", "16"])
+    options = play.parse_options([str(place / "sky.exr"), "--turn", "0,90", "--light-size", "16"])
     lights = inputs.lights(options)
     assert list(lights) == ["sky_0", "sky_90"]
     still, turned = (np.asarray(each.radiance).sum(-1) for each in lights.values())
@@ -186,11 +186,11 @@ def test_lights_are_turned_counterclockwise_as_seen_from_above(place):
 
 def test_environments_are_told_by_their_content_where_the_suffix_says_nothing(place):
     (place / "sky").write_bytes((place / "sky.exr").read_bytes())
-    assert inputs.told_apart([place / "sky", place / "mesh.obj"]) == ([place / "mesh.obj"], [place / "sky"])
+    assert inputs.split_files([place / "sky", place / "mesh.obj"]) == ([place / "mesh.obj"], [place / "sky"])
 
 
 def test_parts_take_materials_by_name_and_by_number():
-    given = play.chosen(["--material", "2=ward", "--material", "pieces=metallic-roughness:roughness=.3"])
+    given = play.parse_options(["--material", "2=ward", "--material", "pieces=metallic-roughness:roughness=.3"])
     kinds = [type(part.material).__name__ for part in inputs.scene(given, playable=True).parts]
     assert kinds == ["TexturedMaterial", "TexturedMaterial", "Ward"]
 

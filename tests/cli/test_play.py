@@ -43,7 +43,7 @@ def main(arguments):
 
 
 def options(*argument: str) -> SimpleNamespace:
-    return play.chosen(argument)
+    return play.parse_options(argument)
 
 
 def test_files_are_told_by_their_names_and_parts_without_a_material_are_plastic(place):

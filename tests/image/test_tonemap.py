@@ -144,14 +144,14 @@ TONE_BOUND = {"srgb": 1e-6, "filmic": 1e-5, "agx": 1e-3, "aces": 1e-5}
 def test_tones_are_the_published_curves(tone):
     shown = tonemap.display(jnp.asarray(COLORS / 4, jnp.float32), tone=tone, stops=2.0)
     np.testing.assert_allclose(tonemap.decode_srgb(shown), PUBLISHED[tone](COLORS), atol=TONE_BOUND[tone], err_msg=tone)
-    by_numpy = tonemap.toned(COLORS, tone, np)
+    by_numpy = tonemap.apply_curve(COLORS, tone, np)
     np.testing.assert_allclose(by_numpy, PUBLISHED[tone](COLORS), atol=TONE_BOUND[tone])
 
 
 @pytest.mark.parametrize("tone", tonemap.TONES)
 def test_tones_map_anything_to_the_display_and_gray_to_increasing_gray(tone):
     gray = np.concatenate([[-1.0, 0], np.geomspace(1e-6, 1e6, 200), [np.inf]])
-    shown = tonemap.toned(np.repeat(gray[:, None], 3, 1), tone, np)
+    shown = tonemap.apply_curve(np.repeat(gray[:, None], 3, 1), tone, np)
     assert shown.min() >= 0
     assert shown.max() <= 1
     np.testing.assert_allclose(shown - shown[:, :1], 0, atol=2e-3)  # rounded matrices

@@ -488,7 +488,7 @@ def test_the_page_displays_colors_by_the_tone_curves_of_python(hand):
     inside = (linear.max(-1) < 0.97) & (linear.min(-1) > 0.03)  # neither clamped nor coarse in bytes
     assert inside.mean() > 0.05
     for tone in tonemap.TONES[1:]:
-        expected = np.asarray(image.encode_srgb(tonemap.toned(linear[inside], tone, np)))
+        expected = np.asarray(image.encode_srgb(tonemap.apply_curve(linear[inside], tone, np)))
         found = shown[tone].reshape(-1, 3)[inside]
         # Bytes of the first picture, and their slope.
         assert np.median(np.abs(found - expected)) < 0.006

@@ -15,7 +15,7 @@ from jaxprt.scene import texture
 from jaxprt.scene.formats.geometry import Geometry, MeshContent, rows_of
 from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.mesh import Mesh, brush, from_file, split
-from jaxprt.scene.scene import Part, numbered
+from jaxprt.scene.scene import Part, unique_names
 
 _GRAY = 0.5  # base color of surfaces without material and color
 
@@ -160,7 +160,7 @@ def split_parts(
     vertices = rows_of(region, np.arange(len(names)))
     return [
         _part(name, mesh, material, geometry, vertex)
-        for name, mesh, material, vertex in zip(numbered(names), meshes, materials, vertices, strict=True)
+        for name, mesh, material, vertex in zip(unique_names(names), meshes, materials, vertices, strict=True)
     ]
 
 

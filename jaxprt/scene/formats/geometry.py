@@ -72,7 +72,7 @@ _MISSING = {
 }
 
 
-def placed(geometry: Geometry, matrix: np.ndarray) -> Geometry:
+def place(geometry: Geometry, matrix: np.ndarray) -> Geometry:
     """Applies an affine transform [4 4] to a geometry. If it mirrors, faces are flipped so that fronts stay outside.
 
     Normals are transformed by the cofactor matrix, which is also defined for singular transforms.
@@ -83,7 +83,7 @@ def placed(geometry: Geometry, matrix: np.ndarray) -> Geometry:
 
 
 def instances(geometry: Geometry, matrices: np.ndarray) -> list[Geometry]:
-    """Applies each of several affine transforms [n 4 4] to a geometry, as `placed` does."""
+    """Applies each of several affine transforms [n 4 4] to a geometry, as `place` does."""
     linear, shift = matrices[:, :3, :3], matrices[:, None, :3, 3]
     columns = linear.transpose(0, 2, 1)
     with np.errstate(over="ignore", invalid="ignore"):  # meshes refuse positions that are not finite
@@ -142,7 +142,7 @@ def first_appearance(label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return value[order], np.argsort(order)[number.reshape(-1)]
 
 
-def joined(geometries: Sequence[Geometry]) -> Geometry:
+def join_geometries(geometries: Sequence[Geometry]) -> Geometry:
     """Joins one or more geometries into one, in order."""
     if len(geometries) == 1:
         return geometries[0]
@@ -336,7 +336,7 @@ def _divide(position: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, np.nd
         turned = _areas(point[concave], np.tile(other, (len(concave), 1, 1)), normal[concave])
         triangle[concave[turned.min(1) > area[concave].min(1)]] = other
         return triangle, crossed
-    plane = _projected(point[concave], normal[concave])
+    plane = _project(point[concave], normal[concave])
     if size > _CLIPPED:
         crosses = np.array([_crosses_itself(corners) for corners in plane], bool)
         concave, crossed, plane = concave[~crosses], concave[crosses], plane[~crosses]
@@ -347,7 +347,7 @@ def _divide(position: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, np.nd
     return triangle, crossed
 
 
-def _projected(point: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def _project(point: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Polygons [p n 3] projected along their unit normals [p n 2]."""
     axis = np.eye(3)[np.abs(normal).argmin(1)]
     across = np.cross(axis, normal)

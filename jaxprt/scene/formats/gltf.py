@@ -22,10 +22,17 @@ from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Sun
 from jaxprt.scene.formats import gltf_geometry, gltf_nodes
 from jaxprt.scene.formats.file_parts import split_parts, store_channels
-from jaxprt.scene.formats.gltf_file import HONORED, Document, check_required, damage_named, excerpt, unread_extensions
+from jaxprt.scene.formats.gltf_file import (
+    HONORED,
+    Document,
+    check_required,
+    excerpt,
+    name_file_in_errors,
+    unread_extensions,
+)
 from jaxprt.scene.formats.gltf_nodes import Node
 from jaxprt.scene.material import Texture, TexturedMaterial
-from jaxprt.scene.scene import PointLight, Scene, numbered
+from jaxprt.scene.scene import PointLight, Scene, unique_names
 
 _HEIGHT = 512  # height of cameras' pictures in pixels
 _WIDEST = 64  # a larger aspect ratio is taken for damage
@@ -47,7 +54,7 @@ def read(
     lights: float = 1.0,
 ) -> Scene:
     """Reads the default scene of a glTF file, as `load_scene` documents."""
-    with damage_named(path):
+    with name_file_in_errors(path):
         document = Document(path, outside=outside)
         check_required(document, geometry=False)
         ignored = set() if time is None else gltf_nodes.pose(document, time, animation)
@@ -362,7 +369,7 @@ def read_lights(
         if "range" in item and kind != "directional":
             ignored.add(_RANGE)
     labels = [str(item.get("name") or owner).encode(errors="replace").decode() for item, owner, _ in placed]
-    unique = numbered([*names, *labels])[len(names) :]
+    unique = unique_names([*names, *labels])[len(names) :]
     points, suns = [], []
     for (item, owner, node), name in zip(placed, unique, strict=True):
         color = document.numbers(item.get("color", [1.0] * 3), (3,), f"the color of {owner}")

@@ -576,7 +576,7 @@ def _is_embedded(uri: str) -> bool:
 
 
 @contextlib.contextmanager
-def damage_named(path: pathlib.Path) -> Iterator[None]:
+def name_file_in_errors(path: pathlib.Path) -> Iterator[None]:
     """Makes all errors that a damaged file causes name the file."""
     must = f"{path} must be an undamaged glTF file"
     try:

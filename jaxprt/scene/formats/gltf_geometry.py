@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxprt import require
-from jaxprt.scene.formats.geometry import Geometry, cofactors, instances, joined
+from jaxprt.scene.formats.geometry import Geometry, cofactors, instances, join_geometries
 from jaxprt.scene.formats.gltf_file import DRACO, Document, Elements, check_required, excerpt
 from jaxprt.scene.formats.gltf_nodes import Node, instance_count, joint_transforms, nodes
 from jaxprt.scene.formats.gltf_nodes import instances as instance_matrices
@@ -472,7 +472,7 @@ def read(document: Document, *, groups: bool = False, scene: Sequence[Node] | No
         for number in (0, 1)
         if f"TEXCOORD_{number}" not in primitive.attribute
     }
-    geometry = joined(parts)._replace(region=region)
+    geometry = join_geometries(parts)._replace(region=region)
     return Contents(geometry, () if groups else tuple(order), frozenset(lacking), frozenset(ignored))
 
 
@@ -629,7 +629,7 @@ def _geometry(document: Document, primitive: Primitive, weight: tuple[float, ...
     if primitive.flat:
         used, face = face.ravel(), np.arange(face.size).reshape(-1, 3)
     else:
-        used, face = _used(face, len(primitive.attribute["POSITION"].value))
+        used, face = _compact_vertices(face, len(primitive.attribute["POSITION"].value))
 
     count = len(primitive.attribute["POSITION"].value)
 
@@ -697,7 +697,7 @@ def _faces(document: Document, primitive: Primitive) -> np.ndarray:
     return np.stack([index[step], index[step + 1 + odd], index[step + 2 - odd]], 1)
 
 
-def _used(face: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _compact_vertices(face: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """The vertices that triangles use, in ascending order, and the triangles as indices to these.
 
     Thousands of primitives may share one array of vertices, so the work is in proportion to the triangles.

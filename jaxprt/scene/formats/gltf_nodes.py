@@ -100,7 +100,7 @@ def instance_count(document: Document, node: Node) -> int:
     Raises:
         ValueError: The attributes of the instances have different counts, or there are none.
     """
-    attributes = _instancing(document, node)
+    attributes = _instance_attributes(document, node)
     if attributes is None:
         return 1
     owner = f"{INSTANCING} of node {node.number}"
@@ -118,7 +118,11 @@ def instances(document: Document, node: Node) -> np.ndarray:
     Raises:
         ValueError: The counts of attributes differ, or a number is not finite, or a rotation is zero.
     """
-    count, attributes, owner = instance_count(document, node), _instancing(document, node), f"node {node.number}"
+    count, attributes, owner = (
+        instance_count(document, node),
+        _instance_attributes(document, node),
+        f"node {node.number}",
+    )
     if attributes is None:
         return node.matrix[None]
     value = {key: attributes[key].numbers() for key in _TRANSFORM if key in attributes}
@@ -139,7 +143,7 @@ def instances(document: Document, node: Node) -> np.ndarray:
     return node.matrix @ local
 
 
-def _instancing(document: Document, node: Node) -> dict[str, Elements] | None:
+def _instance_attributes(document: Document, node: Node) -> dict[str, Elements] | None:
     """The attributes of a node's instances; None if it has one without attributes."""
     owner = f"node {node.number}"
     extensions = document.object(node.item, "extensions", owner)

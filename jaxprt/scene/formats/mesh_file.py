@@ -165,7 +165,7 @@ def read(path: pathlib.Path, *, groups: bool) -> Geometry:
     """Reads the triangles of a file in world coordinates, with regions. Only those of glTF files have colors."""
     check(path)
     if path.suffix.lower() in (".glb", ".gltf"):
-        with gltf_file.damage_named(path):
+        with gltf_file.name_file_in_errors(path):
             return gltf_geometry.read(gltf_file.Document(path), groups=groups).geometry
     return content(path, groups=groups).geometry._replace(color=None)
 

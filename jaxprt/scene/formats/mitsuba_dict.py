@@ -24,7 +24,7 @@ from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.formats import mesh_file
 from jaxprt.scene.formats.file_parts import split_parts
-from jaxprt.scene.formats.geometry import Geometry, placed
+from jaxprt.scene.formats.geometry import Geometry, place
 from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.mesh import grid_face
 from jaxprt.scene.scene import Part, Scene
@@ -164,7 +164,7 @@ class MaterialMaker:
             self._ignored.add(f"anisotropic of {name}, whose roughness has a texture")
         elif stretch:
             aspect = math.sqrt(1 - 0.9 * stretch)
-            field |= _stretched(field["roughness"] ** 2 / aspect, field["roughness"] ** 2 * aspect)
+            field |= _roughness_and_anisotropy(field["roughness"] ** 2 / aspect, field["roughness"] ** 2 * aspect)
         return field
 
     def _conductor(self, item: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -186,8 +186,8 @@ class MaterialMaker:
             self._ignored.add(f"distribution beckmann of {name}")
         alpha = [self._alpha(item.get(key, item.get("alpha", 0.1)), name) for key in ("alpha_u", "alpha_v")]
         if alpha[0] < alpha[1]:  # the direction of anisotropy is that of the larger alpha
-            return field | {"metallic": 1.0, "rotation": math.pi / 2} | _stretched(alpha[1], alpha[0])
-        return field | {"metallic": 1.0} | _stretched(*alpha)
+            return field | {"metallic": 1.0, "rotation": math.pi / 2} | _roughness_and_anisotropy(alpha[1], alpha[0])
+        return field | {"metallic": 1.0} | _roughness_and_anisotropy(*alpha)
 
     def _plastic(self, item: Mapping[str, Any], name: str) -> dict[str, Any]:
         known = {"diffuse_reflectance", "int_ior", "ext_ior", "alpha", "distribution", "nonlinear"}
@@ -249,7 +249,7 @@ class MaterialMaker:
         return Texture(jnp.asarray(image), moved, 0, (wrap, wrap))
 
 
-def _stretched(along: float, across: float) -> dict[str, float]:
+def _roughness_and_anisotropy(along: float, across: float) -> dict[str, float]:
     """Roughness and anisotropy from alpha along and across the direction of anisotropy; along >= across.
 
     KHR_materials_anisotropy defines alpha_t = mix(alpha, 1, anisotropy^2) along and alpha_b = alpha across.
@@ -318,7 +318,7 @@ def _part(name: str, item: Mapping[str, Any], materials: MaterialMaker) -> Part:
             geometry = _flat(geometry)
     else:
         geometry = {"rectangle": _rectangle, "cube": _cube, "sphere": _sphere}[kind](item)
-    geometry = placed(geometry, transform(item.get("to_world"), f"to_world of {name}"))
+    geometry = place(geometry, transform(item.get("to_world"), f"to_world of {name}"))
     if item.get("flip_normals", False):
         normal = None if geometry.normal is None else -geometry.normal
         geometry = geometry._replace(face=geometry.face[:, ::-1], normal=normal)

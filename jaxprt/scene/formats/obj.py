@@ -137,7 +137,7 @@ def read(path: pathlib.Path, *, groups: bool) -> Geometry:
     rows, faces = _statements(source, groups=groups)
     if not len(faces.size):
         raise ValueError(f"{path} must hold vertices and faces, got no faces")
-    return _geometry(rows, _sound(faces, rows, source), source)
+    return _geometry(rows, _absolute_indices(faces, rows, source), source)
 
 
 def _statements(source: _Source, *, groups: bool) -> tuple[list[_Rows], _Faces]:
@@ -242,7 +242,7 @@ def _whole(word: bytes) -> int:
     return number if abs(number := int(word)) < -_WRONG else _WRONG
 
 
-def _sound(faces: _Faces, rows: list[_Rows], source: _Source) -> _Faces:
+def _absolute_indices(faces: _Faces, rows: list[_Rows], source: _Source) -> _Faces:
     """Faces with indices from 0. Indices are -1 where a face has none or refers to something that does not exist.
 
     Raises:
@@ -448,7 +448,7 @@ def _material(
     field |= _opacity(statements, "alpha_texture" in field, path, name, ignored)
     if blender is not None:
         field |= _principled(value, field.keys(), blender)
-        return _checked(field, path, name)
+        return _make_material(field, path, name)
     # A Phong lobe of exponent n corresponds to alpha = sqrt(2 / (n + 2)); roughness is the square root of alpha.
     roughness = (2 / (max(0.0, value.get("Ns", 0.0)) + 2)) ** 0.25
     if (value.keys() | statements.keys()) & {"Pr", "Pm", "map_Pr", "map_Pm"}:
@@ -459,7 +459,7 @@ def _material(
         field |= {"metallic": 0.0, "roughness": roughness, "specular": 0.0}
     else:  # with the default index of refraction the reflectance is 4 % times the color
         field |= {"metallic": 0.0, "roughness": roughness, "specular_color": value["Ks"] / 0.04}
-    return _checked(field, path, name)
+    return _make_material(field, path, name)
 
 
 def _opacity(
@@ -497,7 +497,7 @@ def _principled(value: dict[str, Any], stated: Collection[str], exponent: float)
     }
 
 
-def _checked(field: dict[str, Any], path: pathlib.Path, name: str) -> TexturedMaterial:
+def _make_material(field: dict[str, Any], path: pathlib.Path, name: str) -> TexturedMaterial:
     """Makes the material. Errors name the file and the material."""
     try:
         with np.errstate(over="ignore"):  # materials refuse what is not finite

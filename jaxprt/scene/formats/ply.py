@@ -185,11 +185,11 @@ def read_elements(content: bytes, header: Header, names: set[str], lists: set[st
             columns = (_columns(table, element, lists) for table in text.tables(rows, element.rows, element.name))
             blocks = [block for block in columns if read]  # other rows are read too, because the next ones follow
         elif all(item.length is None for item in element.properties):
-            blocks, at = [_fixed(content, at, element)], at + element.rows * element.row_size
+            blocks, at = [_fixed_columns(content, at, element)], at + element.rows * element.row_size
         else:
             blocks, at = _variable(content, at, element, lists if read else None)
         if read:
-            tables[element.name] = _joined(blocks, element)
+            tables[element.name] = _join_blocks(blocks, element)
     return tables
 
 
@@ -199,14 +199,14 @@ def _columns(table: text.Table, element: Element, lists: set[str]) -> Columns:
     for index, item in enumerate(element.properties, 1):
         rest = len(element.properties) - index
         if item.length is None:
-            columns[item.name] = _typed(table.column(rest), item.dtype)
+            columns[item.name] = _cast(table.column(rest), item.dtype)
         else:
             value, length = table.lists(rest)
             columns[item.name] = Lists(value if item.name in lists else value[:0].copy(), length)
     return columns
 
 
-def _typed(value: np.ndarray, dtype: np.dtype) -> np.ndarray:
+def _cast(value: np.ndarray, dtype: np.dtype) -> np.ndarray:
     """Numbers of text in the type of the header, which states the largest value of colors. Fractions stay floats."""
     if dtype.kind == "f" or (value != np.round(value)).any():
         return value
@@ -214,7 +214,7 @@ def _typed(value: np.ndarray, dtype: np.dtype) -> np.ndarray:
     return np.clip(value, limit.min, limit.max).astype(dtype) if limit.bits < 64 else value
 
 
-def _fixed(content: bytes, at: int, element: Element) -> Columns:
+def _fixed_columns(content: bytes, at: int, element: Element) -> Columns:
     """The columns of rows without lists."""
     fields = [(f"{index}", item.dtype) for index, item in enumerate(element.properties)]
     row = np.frombuffer(content, np.dtype(fields), element.rows, at)
@@ -334,7 +334,7 @@ def _row_starts(content: bytes, at: int, element: Element) -> Iterator[int]:
     yield at
 
 
-def _joined(blocks: list[Columns], element: Element) -> Columns:
+def _join_blocks(blocks: list[Columns], element: Element) -> Columns:
     """Joins the columns of blocks."""
     columns: Columns = {}
     for item in element.properties:
@@ -458,7 +458,7 @@ def _ply_content(
     elif images:
         regions = [images[0]]
         ignored |= {f"TextureFile {image} (no face has its texnumber)" for image in images[1:]}
-    rows = {key: _padded(value, len(faces.size)) for key, value in of_face.items()}
+    rows = {key: _pad_to_strips(value, len(faces.size)) for key, value in of_face.items()}
     return MeshContent(geometry.from_polygons(position, faces, of_vertex, of_corner, rows, name), regions, ignored)
 
 
@@ -490,6 +490,6 @@ def _wedges(face: Columns, faces: Polygons, corners: int) -> np.ndarray | None:
     return texture
 
 
-def _padded(value: np.ndarray | None, count: int) -> np.ndarray | None:
+def _pad_to_strips(value: np.ndarray | None, count: int) -> np.ndarray | None:
     """Rows of faces, with rows for triangles of strips, which have the values of the first face."""
     return value if value is None else np.concatenate([value, np.repeat(value[:1], count - len(value), axis=0)])

@@ -117,17 +117,17 @@ def numbers(words: Words, *, kind: type = float) -> np.ndarray:
     """
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # older NumPy only warns of words that are not numbers
-        number = _parsed(words.text, len(words.start), kind)
+        number = _parse(words.text, len(words.start), kind)
         if number is not None:
             return number
         # The rows are parsed in the same way: other parsers take other words, such as Python's "1_000".
         for index, (row, count) in enumerate(zip(words.text.split(b"\n"), words.per_row.tolist(), strict=True)):
-            if _parsed(row, count, kind) is None:
+            if _parse(row, count, kind) is None:
                 raise RowError(index)
     raise RowError(0)
 
 
-def _parsed(words: bytes, count: int, kind: type) -> np.ndarray | None:
+def _parse(words: bytes, count: int, kind: type) -> np.ndarray | None:
     """The numbers of `count` words; None if they are not all numbers."""
     if not count:
         return np.zeros(0, kind)
@@ -186,14 +186,14 @@ class Table:
             )
         count = np.minimum(count, len(self._number) + 1)
         self._require(start + 1 + count + rest)
-        value = self._number[ragged(self._at, count)]
+        value = self._number[list_indices(self._at, count)]
         self._at = self._at + count
         return value, count
 
     def remaining(self) -> tuple[np.ndarray, np.ndarray]:
         """The rest of each row: all numbers, and how many there are in each row."""
         count = self._end - self._at
-        return self._number[ragged(self._at, count)], count
+        return self._number[list_indices(self._at, count)], count
 
     def _require(self, end: np.ndarray) -> None:
         wrong = np.flatnonzero(end > self._end)
@@ -261,7 +261,7 @@ def whole_lists(value: np.ndarray, length: np.ndarray, what: str) -> np.ndarray:
     return whole(value)
 
 
-def ragged(start: np.ndarray, count: np.ndarray) -> np.ndarray:
+def list_indices(start: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Indices of the items of lists, from the index of the first item and the length of each list."""
     end = np.cumsum(count)
     return np.arange(end[-1] if len(end) else 0) + np.repeat(start - (end - count), count)

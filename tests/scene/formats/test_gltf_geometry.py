@@ -13,7 +13,7 @@ from jaxprt.files import write_png
 from jaxprt.scene import load_mesh, load_scene
 from jaxprt.scene.formats import gltf_geometry
 from jaxprt.scene.formats.gltf_file import Elements
-from jaxprt.scene.scene import numbered
+from jaxprt.scene.scene import unique_names
 from tests.scene.formats.gltf_writer import FACE, PLACE, SQUARE, Writer, one
 
 # A closed octahedron with shared vertices; no two of its faces have the same normal.
@@ -552,8 +552,8 @@ def test_a_chain_of_ten_thousand_nodes_adds_up(tmp_path):
 
 
 def test_thousands_of_equal_names_are_numbered_in_order():
-    assert numbered(["a", "a 2", "a", "a", "b", "a 2"]) == ["a", "a 2", "a 3", "a 4", "b", "a 2 2"]
-    names = numbered(["wood"] * 30_000)
+    assert unique_names(["a", "a 2", "a", "a", "b", "a 2"]) == ["a", "a 2", "a 3", "a 4", "b", "a 2 2"]
+    names = unique_names(["wood"] * 30_000)
     assert names[:2] == ["wood", "wood 2"]
     assert names[-1] == "wood 30000"
     assert len(set(names)) == 30_000

@@ -246,11 +246,11 @@ def test_files_that_exceed_the_memory_are_refused(place, monkeypatch):
 def test_the_command_line_allows_it_by_an_option(place):
     path = scene_of_buffer(place, "../secret")
     with pytest.raises(ValueError, match="--outside"):
-        command_inputs.scene(play.chosen([str(path)]))
-    assert len(command_inputs.scene(play.chosen([str(path), "--outside"])).parts[0].mesh.face) == 2
+        command_inputs.scene(play.parse_options([str(path)]))
+    assert len(command_inputs.scene(play.parse_options([str(path), "--outside"])).parts[0].mesh.face) == 2
     with pytest.raises(ValueError, match="--outside"):
-        info.about(path, 8, outside=False)
-    assert info.about(path, 8, outside=True)["triangles"] == 2
+        info.describe_path(path, 8, outside=False)
+    assert info.describe_path(path, 8, outside=True)["triangles"] == 2
 
 
 def test_a_backslash_may_belong_to_a_name(tmp_path):
