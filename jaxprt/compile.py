@@ -128,43 +128,58 @@ def isolated(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:
     def branched(*argument, **named):
         option = {name: named.pop(name) for name in static if name in named}
 
-        def own(argument, named):
+        def whole(argument, named):
             return function(*argument, **named, **option)
 
         def never(argument, named):
-            return jax.tree.map(lambda each: jnp.zeros(each.shape, each.dtype), shape)
+            return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
 
-        shape = jax.eval_shape(own, argument, named)
-        first = next(each for each in jax.tree.leaves((argument, named)) if each.size)
+        shape = jax.eval_shape(whole, argument, named)
+        first = next(leaf for leaf in jax.tree.leaves((argument, named)) if leaf.size)
         # A branch is not fused with its surroundings. The CPU compiler does not detect that this branch is always
         # taken;
         # other compilers do, and remove the branch.
         taken = jax.lax.platform_dependent(
             jax.lax.stop_gradient(first).ravel()[0].astype(jnp.int32), cpu=lambda x: (x | 1) != 0, default=_always
         )
-        return jax.lax.cond(taken, own, never, argument, named)
+        return jax.lax.cond(taken, whole, never, argument, named)
 
     inside = jit(branched, static_argnames=static)  # traced once, also for derivatives outside of any jit
 
     @functools.wraps(function)
     def step(*argument, **named):
-        leaf = jax.tree.leaves((argument, {name: each for name, each in named.items() if name not in static}))
-        traced = any(isinstance(each, Tracer) for each in leaf) and any(np.size(each) for each in leaf)
+        leaf = jax.tree.leaves((argument, {name: value for name, value in named.items() if name not in static}))
+        traced = any(isinstance(value, Tracer) for value in leaf) and any(np.size(value) for value in leaf)
         return (inside if traced else compiled)(*argument, **named)
 
     return step
 
 
-def finished(made: PyTree, between: Between) -> PyTree:
+def numba_loop(function: Callable, **options: Any) -> Callable:
+    """Compiles a loop by numba, on disk too where the package's folder or the user's cache can be written.
+
+    Args:
+        function: The loop. It releases the global interpreter lock.
+        options: Further options of `numba.njit`.
+    """
+    import numba  # takes half a second
+
+    try:
+        return numba.njit(nogil=True, cache=True, **options)(function)
+    except RuntimeError:  # no folder to write to
+        return numba.njit(nogil=True, **options)(function)
+
+
+def finished(result: PyTree, between: Between) -> PyTree:
     """Waits until the device has computed the result of a step, calls `between`, and returns the result.
 
     `between` may raise to abort the computation. If it is None, the result is returned immediately, while the device
     may still be computing it. Do not use this inside `jax.jit`.
     """
     if between is not None:
-        jax.block_until_ready(made)
+        jax.block_until_ready(result)
         between()
-    return made
+    return result
 
 
 def _always(_: Array) -> Array:
@@ -204,7 +219,7 @@ def mapped(function: Callable[[PyTree], PyTree], rows: PyTree) -> PyTree:
         rows: Arrays with the rows along the first axis.
     """
     one = _first(rows)
-    size = sum(each.size for each in jax.tree.leaves((one, jax.eval_shape(function, one))))
+    size = sum(leaf.size for leaf in jax.tree.leaves((one, jax.eval_shape(function, one))))
     count = len(jax.tree.leaves(rows)[0])
     most = _at_once(count, 8 * size)
 
@@ -216,7 +231,7 @@ def mapped(function: Callable[[PyTree], PyTree], rows: PyTree) -> PyTree:
 
 def _first(rows: PyTree) -> PyTree:
     """Shapes and types of one row."""
-    return jax.tree.map(lambda each: jax.ShapeDtypeStruct(each.shape[1:], each.dtype), rows)
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), rows)
 
 
 def _at_once(count: int, size: int) -> int:
@@ -229,10 +244,10 @@ def _blocks(rows: PyTree, size: int) -> tuple[PyTree | None, PyTree]:
     count = len(jax.tree.leaves(rows)[0])
     most = _at_once(count, size)
     whole = max(0, (count - 1) // most)
-    rest = jax.tree.map(lambda each: each[whole * most :], rows)
+    rest = jax.tree.map(lambda leaf: leaf[whole * most :], rows)
     if not whole:
         return None, rest
-    return jax.tree.map(lambda each: each[: whole * most].reshape(whole, most, *each.shape[1:]), rows), rest
+    return jax.tree.map(lambda leaf: leaf[: whole * most].reshape(whole, most, *leaf.shape[1:]), rows), rest
 
 
 def linear(
@@ -295,19 +310,19 @@ def _run(x: Array, *leaf: Array, pair: _Pair, back: bool) -> Array:
 def _abstract(x, *leaf, pair: _Pair, back: bool):
     if back:
         return x.update(shape=pair.shape, dtype=pair.dtype)
-    found = jax.eval_shape(partial(pair.run, back=False), *(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in (x, *leaf)))
-    return x.update(shape=found.shape, dtype=found.dtype)
+    form = jax.eval_shape(partial(pair.run, back=False), *(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in (x, *leaf)))
+    return x.update(shape=form.shape, dtype=form.dtype)
 
 
 def _jvp(primals, tangents, *, pair: _Pair, back: bool):
     (x, *leaf), (dx, *dleaf) = primals, tangents
     parts = [] if isinstance(dx, ad.Zero) else [_linear.bind(dx, *leaf, pair=pair, back=back)]
-    moving = [n for n, each in enumerate(dleaf) if not isinstance(each, ad.Zero)]
+    moving = [n for n, slope in enumerate(dleaf) if not isinstance(slope, ad.Zero)]
     if moving:
 
         def at(*moved):
-            every = dict(zip(moving, moved, strict=True))
-            return pair.derived(x, *(every.get(n, each) for n, each in enumerate(leaf)), back=back)
+            change = dict(zip(moving, moved, strict=True))
+            return pair.derived(x, *(change.get(n, value) for n, value in enumerate(leaf)), back=back)
 
         parts.append(jax.jvp(at, tuple(leaf[n] for n in moving), tuple(dleaf[n] for n in moving))[1])
     return _linear.bind(x, *leaf, pair=pair, back=back), reduce(jnp.add, parts)
@@ -320,12 +335,12 @@ def _transpose(cotangent, x, *leaf, pair: _Pair, back: bool):
 
 
 def _batched(argument, axis, *, pair: _Pair, back: bool):
-    size = next(each.shape[n] for each, n in zip(argument, axis, strict=True) if n is not None)
-    x, *leaf = (each if n is None else jnp.moveaxis(each, n, 0) for each, n in zip(argument, axis, strict=True))
+    size = next(array.shape[n] for array, n in zip(argument, axis, strict=True) if n is not None)
+    x, *leaf = (array if n is None else jnp.moveaxis(array, n, 0) for array, n in zip(argument, axis, strict=True))
     if axis[0] is None:
         x = jnp.broadcast_to(x, (size, *x.shape))
-    own = tuple(None if n is None else 0 for n in axis[1:])
-    wide = _Pair(_Batch(pair.forward, own), _Batch(pair.backward, own), pair.tree, (size, *pair.shape), pair.dtype)
+    axes = tuple(None if n is None else 0 for n in axis[1:])
+    wide = _Pair(_Batch(pair.forward, axes), _Batch(pair.backward, axes), pair.tree, (size, *pair.shape), pair.dtype)
     return _linear.bind(x, *leaf, pair=wide, back=back), 0
 
 
@@ -352,7 +367,7 @@ def shared_size(count: int, *, fine: bool = False) -> int:
 def put(value: Any) -> Any:
     """Arrays of the host on the device, without a program, and also while JAX traces a function."""
     with compile_time():
-        return jax.tree.map(lambda each: jax.device_put(each) if isinstance(each, np.ndarray) else each, value)
+        return jax.tree.map(lambda leaf: jax.device_put(leaf) if isinstance(leaf, np.ndarray) else leaf, value)
 
 
 def compile_time(*value: Any) -> contextlib.AbstractContextManager:
@@ -367,4 +382,4 @@ def compile_time(*value: Any) -> contextlib.AbstractContextManager:
 
 def known(*value: Any) -> bool:
     """Whether JAX traces none of the arrays."""
-    return not any(isinstance(each, Tracer) for each in jax.tree.leaves(value))
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value))

@@ -337,7 +337,7 @@ def available_memory() -> int | None:
         stats = device.memory_stats() or {}
         if "bytes_limit" in stats:
             free.append(stats["bytes_limit"] - stats.get("bytes_in_use", 0))
-    known = [each for each in free if each is not None]
+    known = [bytes_free for bytes_free in free if bytes_free is not None]
     return min(known) if known else None
 
 
@@ -371,7 +371,7 @@ def kind(name: str, value: Any, *wanted: type, source: str) -> None:
         TypeError: The object is of another class.
     """
     if not isinstance(value, wanted):
-        names = " or ".join(each.__name__ for each in wanted)
+        names = " or ".join(kind.__name__ for kind in wanted)
         raise TypeError(f"{name} must be of class {names}, which {source} makes, got {_described(value)}")
 
 
@@ -389,11 +389,11 @@ def array(name: str, value: Any, *axes: str, source: str = "") -> None:
         ValueError: The array has a wrong number of axes or a wrong size.
     """
     shape = value.shape if isinstance(value, jax.Array | np.ndarray) else None
-    if shape is not None and any(_fits(shape, each.split()) for each in axes):
+    if shape is not None and any(_fits(shape, axis.split()) for axis in axes):
         return
-    required = " or ".join(f"[{', '.join(each.split())}]" for each in axes)
-    made = f", which {source} makes" if source else ""
-    message = f"{name} must be an array {required}{made}, got {_described(value)}"
+    required = " or ".join(f"[{', '.join(axis.split())}]" for axis in axes)
+    advice = f", which {source} makes" if source else ""
+    message = f"{name} must be an array {required}{advice}, got {_described(value)}"
     raise TypeError(message) if shape is None else ValueError(message)
 
 

@@ -6,24 +6,17 @@ the value of each bit pattern of half precision, in the units of the file.
 """
 
 import math
-from collections.abc import Callable
+from functools import partial
 from typing import no_type_check
 
-import numba
+from jaxprt.compile import numba_loop
 
 FINE = 8  # pieces along the edge of a bright pixel, at least
-
-
-def _compiled(function: Callable) -> Callable:
-    """The function compiled by numba, on disk too where the package's folder or the user's cache can be written."""
-    try:
-        return numba.njit(nogil=True, cache=True, error_model="numpy")(function)
-    except RuntimeError:  # no folder to write to
-        return numba.njit(nogil=True, error_model="numpy")(function)
+_loop = partial(numba_loop, error_model="numpy")
 
 
 @no_type_check  # Run-time type checks would wrap the function, and numba could not cache it on disk.
-@_compiled
+@_loop
 def _project(x, y, z):
     """Face of the cube and the coordinates (s, t) on it, as in `cubemap.project`."""
     right, up, near = abs(x), abs(y), abs(z)
@@ -41,7 +34,7 @@ def _project(x, y, z):
 
 
 @no_type_check
-@_compiled
+@_loop
 def _unproject(face, s, t):
     """A direction, not normalized, from a point on a face or beyond its edges, as in `cubemap.unproject`."""
     side = -1.0 if face % 2 else 1.0
@@ -53,7 +46,7 @@ def _unproject(face, s, t):
 
 
 @no_type_check
-@_compiled
+@_loop
 def _pixel(cube, height, width, face, row, column):
     """Index of a pixel in its level, which may lie one pixel beyond the edge of its face."""
     if not cube:
@@ -73,13 +66,13 @@ def _pixel(cube, height, width, face, row, column):
 
 
 @no_type_check
-@_compiled
+@_loop
 def _radiance(half, radiance, pixel):
     return radiance[half[pixel, 0]], radiance[half[pixel, 1]], radiance[half[pixel, 2]]
 
 
 @no_type_check
-@_compiled
+@_loop
 def _bilinear(half, radiance, first, cube, height, width, face, down, right):
     """Radiance of a level at a point, from 0 to 1 down and to the right of a face."""
     row, column = down * height - 0.5, right * width - 0.5
@@ -95,7 +88,7 @@ def _bilinear(half, radiance, first, cube, height, width, face, down, right):
 
 
 @no_type_check
-@_compiled
+@_loop
 def sample(half, radiance, first, height, width, cube, turn, direction, angle, color):
     """Radiance from some directions: bilinear within a level and linear between two levels.
 
@@ -131,7 +124,7 @@ def sample(half, radiance, first, height, width, cube, turn, direction, angle, c
 
 
 @no_type_check
-@_compiled
+@_loop
 def add_disks(disk, direction, angle, color):
     """Adds the radiance of round lamps to `color`, with edges as soft as the pixel around each direction is wide.
 
@@ -153,7 +146,7 @@ def add_disks(disk, direction, angle, color):
 
 
 @no_type_check
-@_compiled
+@_loop
 def _add_flux(total, size, matrix, x, y, z, area, red, green, blue):
     """Adds the flux and area of a small part of the sphere to the texel of a cubemap that it lies in after a turn."""
     face, s, t = _project(
@@ -172,7 +165,7 @@ def _add_flux(total, size, matrix, x, y, z, area, red, green, blue):
 
 
 @no_type_check
-@_compiled
+@_loop
 def latlong_flux(half, radiance, height, width, parts, bright, matrix, size, total, excess):
     """Adds flux and solid angle of a latlong level to the texels of a cubemap.
 
@@ -215,7 +208,7 @@ def latlong_flux(half, radiance, height, width, parts, bright, matrix, size, tot
 
 
 @no_type_check
-@_compiled
+@_loop
 def _add_pieces(total, size, matrix, face, row, column, n, parts, red, green, blue):
     """Adds the flux and area of a pixel of a cube to the texels of a cubemap, in pieces."""
     piece = (2 / (n * parts)) ** 2
@@ -229,7 +222,7 @@ def _add_pieces(total, size, matrix, face, row, column, n, parts, red, green, bl
 
 
 @no_type_check
-@_compiled
+@_loop
 def cube_flux(half, radiance, n, _, parts, bright, matrix, size, total, excess):
     """Adds flux and solid angle of a cube's level to the texels of a cubemap, as `latlong_flux` does."""
     for face in range(6):

@@ -13,6 +13,7 @@ from numba import carray  # pyright: ignore[reportPrivateImportUsage]
 from numba.core import types
 from numba.extending import intrinsic
 
+from jaxprt.compile import numba_loop
 from jaxprt.scene import texture
 from jaxprt.scene.mesh import BLEND, CLEAR, Opacity
 from jaxprt.scene.subdivision import places
@@ -199,7 +200,7 @@ def _wrap(place, mode):
 
 
 @no_type_check
-@packets.compiled
+@numba_loop
 def _alpha(table, face, u, v):
     """The opacity of a point: 0 or 1 for a surface with holes, the share of light that it stops for others."""
     coordinate = carray(_pointer(table[0] + 24 * face), 6, np.float32)
@@ -289,7 +290,7 @@ def _veil(argument):
 
 
 @no_type_check
-@packets.compiled
+@numba_loop
 def _insert(context, slot, distance, face, alpha):
     """Adds a hit to the list of a ray, which is sorted by distance, and by triangle where several coincide."""
     count = carray(_pointer(context[_FIELD] + 4 * slot), 1, np.int32)
@@ -314,7 +315,7 @@ _filter = packets.callback(types.void(types.voidptr), _veil)
 
 
 @no_type_check
-@packets.compiled
+@numba_loop
 def _empty_context(context, arguments, mode):
     """Fills the context of rays and the arguments of a query: flags and features, context, filter, callback.
 
@@ -329,7 +330,7 @@ def _empty_context(context, arguments, mode):
 
 
 @no_type_check
-@packets.compiled
+@numba_loop
 def _no_hit(ray):
     """Sets the fields of RTCRayHit16 that tell that nothing is hit."""
     number = ray.view(np.uint32)
@@ -339,7 +340,7 @@ def _no_hit(ray):
 
 
 @no_type_check
-@packets.compiled
+@numba_loop
 def _trace_shares(address, scene, origin, direction, point, way, share):
     context, arguments = np.empty(16, np.int64), np.empty(4, np.int64)
     _empty_context(context, arguments, _PASSED)
@@ -361,7 +362,7 @@ def _trace_shares(address, scene, origin, direction, point, way, share):
 
 
 @no_type_check
-@packets.compiled
+@numba_loop
 def _trace_blocked(origin, direction, point, way, share):
     result = np.empty(len(point), np.bool_)
     for at in range(len(point)):
@@ -378,7 +379,7 @@ def _trace_blocked(origin, direction, point, way, share):
 
 
 @no_type_check
-@packets.compiled
+@numba_loop
 def _first(address, scene, origin, direction, face, part, distance, weight):
     context, arguments = np.empty(16, np.int64), np.empty(4, np.int64)
     _empty_context(context, arguments, _FIRST)
@@ -405,7 +406,7 @@ def _first(address, scene, origin, direction, face, part, distance, weight):
 
 
 @no_type_check
-@packets.compiled
+@numba_loop
 def _collect(address, scene, origin, direction, far, hidden, count, place, face, alpha):
     context, arguments = np.empty(16, np.int64), np.empty(4, np.int64)
     _empty_context(context, arguments, _LAYERS)

@@ -230,23 +230,15 @@ def call(typing, address, valid, scene, ray, arguments):
 
 
 def callback(signature: Any, function: Callable) -> Any:
-    """A function that C calls, compiled by numba as `compiled` compiles; its address is `address`."""
+    """A function that C calls, compiled by numba as `numba_loop` compiles; its address is `address`."""
     try:
         return numba.cfunc(signature, cache=True)(function)
     except RuntimeError:
         return numba.cfunc(signature)(function)
 
 
-def compiled(function: Callable, **options: Any) -> Callable:
-    """The function compiled by numba, on disk too where the package's folder or the user's cache can be written."""
-    try:
-        return numba.njit(nogil=True, cache=True, **options)(function)
-    except RuntimeError:
-        return numba.njit(nogil=True, **options)(function)
-
-
 @no_type_check  # Run-time type checks would wrap the function, and numba could not cache it on disk.
-@compiled
+@numba_loop
 def ray_buffers(rows):
     """Memory of a packet, aligned to 64 bytes: rows of sixteen values, and which rays are valid.
 
@@ -259,7 +251,7 @@ def ray_buffers(rows):
 
 
 @no_type_check
-@compiled
+@numba_loop
 def _trace_blocked(address, scene, arguments, origin, direction, point, way, result):
     ray, valid = ray_buffers(12)
     for packet in range(0, len(point), 16):
@@ -277,7 +269,7 @@ def _trace_blocked(address, scene, arguments, origin, direction, point, way, res
 
 
 @no_type_check
-@compiled
+@numba_loop
 def start(surface, points, point, lane, origin, facing):
     """Places of a lane's ray origins in a pixel, and the unit normal of its triangle on the side of the shading normal.
 
@@ -315,7 +307,7 @@ def start(surface, points, point, lane, origin, facing):
 
 
 @no_type_check
-@compiled
+@numba_loop
 def _edge_vector(position, first, last):
     """The vector from one vertex to another in float64."""
     return (
@@ -326,7 +318,7 @@ def _edge_vector(position, first, last):
 
 
 @no_type_check
-@compiled
+@numba_loop
 def trace_shares(query, surface, points, texels, first, last, share):
     """Visible shares of texels at points of a picture; `jaxprt.visibility.picture_rays.shares` explains the method.
 
@@ -376,7 +368,7 @@ def trace_shares(query, surface, points, texels, first, last, share):
 
 
 @no_type_check
-@compiled
+@numba_loop
 def begin(ray, lane, slot, far):
     """Sets the fields of a ray besides its origin and direction.
 
@@ -396,7 +388,7 @@ def begin(ray, lane, slot, far):
 
 
 @no_type_check
-@compiled
+@numba_loop
 def whole_ray(ray):
     """Sets these fields of sixteen rays without an end, which are numbered by their place in the packet."""
     for lane in range(16):
@@ -404,7 +396,7 @@ def whole_ray(ray):
 
 
 @no_type_check  # Run-time type checks would wrap the function, and numba could not cache it on disk.
-@partial(compiled, error_model="numpy")  # Checks of divisors would keep the loop over lanes from being vectorized.
+@partial(numba_loop, error_model="numpy")  # Checks of divisors would keep the loop over lanes from being vectorized.
 def _sums(place, area, begin, count, center, normal, least, total, room):
     """Adds the integrals of places of one piece to `total`, for sixteen points; False if a point is too close to one.
 
@@ -435,7 +427,7 @@ def _sums(place, area, begin, count, center, normal, least, total, room):
 
 
 @no_type_check
-@compiled
+@numba_loop
 def _lit_share(lamp, lamps, center, normal, least, total, room):
     """The integrals of all pieces of a lamp without shadows, from the fewest places that are not too close."""
     place, area, first, count, pieces, _ = lamps
@@ -457,7 +449,7 @@ def _lit_share(lamp, lamps, center, normal, least, total, room):
 
 
 @no_type_check
-@partial(compiled, error_model="numpy")
+@partial(numba_loop, error_model="numpy")
 def _cast(query, memory, lamps, aim, origin, sight, weight, free):
     """Traces one ray of each of sixteen points, to its own place on a lamp; the number of rays, and of free ones.
 
@@ -502,7 +494,7 @@ def _cast(query, memory, lamps, aim, origin, sight, weight, free):
 
 
 @no_type_check
-@compiled
+@numba_loop
 def _visible(query, memory, lamp, lamps, pattern, origin, sight, total, weight, free):
     """Replaces `free` by the visible share of each piece of a lamp at sixteen points.
 
@@ -540,7 +532,7 @@ def _visible(query, memory, lamp, lamps, pattern, origin, sight, total, weight, 
 
 
 @no_type_check
-@compiled
+@numba_loop
 def _light_point(surface, points, fields, packet, lanes, origin, sight, pattern):
     """Sets what does not depend on lamps for sixteen points. Padding has no normal, and nothing above its horizon."""
     position, normals = fields
@@ -557,7 +549,7 @@ def _light_point(surface, points, fields, packet, lanes, origin, sight, pattern)
 
 
 @no_type_check
-@compiled
+@numba_loop
 def trace_lamps(query, surface, points, fields, lamps, first, last, result):
     """Integrals of the visible parts of lamps at some points; see `jaxprt.visibility.picture_rays.moments`.
 
@@ -599,7 +591,7 @@ def trace_lamps(query, surface, points, fields, lamps, first, last, result):
 
 
 @no_type_check
-@compiled
+@numba_loop
 def _write(total, free, normal, row, packet, lanes, result):
     """Writes the integrals of the visible part of a piece."""
     solid, cosine, direction = result
