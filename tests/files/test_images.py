@@ -1,3 +1,5 @@
+"""Image files: what is read, of which formats, and what is refused."""
+
 import os
 import pathlib
 import re
@@ -5,11 +7,27 @@ import struct
 import zlib
 
 import numpy as np
+import OpenEXR
 import OpenImageIO
 import pytest
 
 from jaxprt import require
 from jaxprt.files import decode_image, images, pixels, read_image, write_exr, write_png
+
+AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.0770, 0.32168, 0.33767)
+# ACES2065-1 to linear sRGB with Bradford's adaptation, from the OpenColorIO configuration of ACES.
+AP0_TO_REC709 = np.array(
+    [
+        [2.52168618674388, -1.13413098823972, -0.387555198504164],
+        [-0.276479914229922, 1.37271908766826, -0.096239173438334],
+        [-0.0153780649660342, -0.152975335867399, 1.16835340083343],
+    ]
+)
+MATRIX_ERROR = 2e-5  # of chromaticities in float32
+# Two pixels and the radiance that they stand for: mantissa / 256 * 2^(exponent - 128).
+RED, SKY = bytes([128, 64, 32, 129]), bytes([16, 32, 128, 131])
+VALUE = {RED: [1.0, 0.5, 0.25], SKY: [0.5, 1.0, 4.0]}
+HEAD = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n"
 
 
 def random_image(*shape, seed=0):
@@ -287,3 +305,477 @@ def test_large_tiles_of_a_small_tiff_are_refused_before_they_are_read(tmp_path, 
     monkeypatch.setattr(require, "available_memory", lambda: 10**9)
     with pytest.raises(MemoryError, match=r"tile\.tif: 16 x 16 pixels .* take 1\.2 GB"):
         read_image(path)
+
+
+def write_exr_channels(path, channels, **header):
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
+    with OpenEXR.File(header, dict(channels)) as file:  # It changes the dictionary.
+        file.write(str(path))
+
+
+def planes(image, names="RGB", prefix=""):
+    return {prefix + name: np.ascontiguousarray(image[..., i]) for i, name in enumerate(names)}
+
+
+def write_parts(path, **parts):
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    made = [OpenEXR.Part(header | more, dict(channels), name) for name, (channels, more) in parts.items()]
+    with OpenEXR.File(made) as file:
+        file.write(str(path))
+
+
+def write_tiles(path, image, tile, form="half"):
+    spec = OpenImageIO.ImageSpec(image.shape[1], image.shape[0], image.shape[2], form)
+    spec.tile_width, spec.tile_height = tile
+    output = OpenImageIO.ImageOutput.create("exr")
+    assert output.open(str(path), spec)
+    assert output.write_image(np.ascontiguousarray(image))
+    assert output.close()
+
+
+def test_mip_mapped_tiles_are_read_at_the_finest_level(data):
+    image, attributes = read_image(data / "env" / "KernerEnvCube.exr")
+    assert image.shape == (1536, 256, 4)
+    assert attributes["envmap"] == "cube"
+
+
+def test_tristimulus_values_do_not_pass_for_gray_and_a_depth_beside_gray_is_ignored(tmp_path):
+    image = random_image(4, 6, 3)
+    write_exr_channels(tmp_path / "xyz.exr", planes(image, "XYZ"))
+    with pytest.raises(ValueError, match=r"xyz\.exr must have .*, got X, Y, Z: convert CIE XYZ to RGB"):
+        read_image(tmp_path / "xyz.exr")
+    write_exr_channels(tmp_path / "depth.exr", planes(image, "YZ"))
+    np.testing.assert_array_equal(read_image(tmp_path / "depth.exr")[0][..., 0], image[..., 0])
+
+
+def test_exr_channels_are_found_in_any_order_and_type(tmp_path):
+    red, green, blue = (np.ascontiguousarray(random_image(4, 4, 3)[..., i]) for i in range(3))
+    half = {"R": red.astype(np.float16), "G": green.astype(np.float16), "B": blue.astype(np.float16)}
+    write_exr_channels(tmp_path / "half.exr", half)
+    np.testing.assert_array_equal(
+        read_image(tmp_path / "half.exr")[0], np.stack(list(half.values()), -1).astype(np.float32)
+    )
+    write_exr_channels(tmp_path / "mixed.exr", {"Z": red, "B": blue, "A": half["R"], "G": green, "R": red})
+    np.testing.assert_array_equal(
+        read_image(tmp_path / "mixed.exr")[0], np.stack([red, green, blue, half["R"].astype(np.float32)], -1)
+    )
+
+
+def test_cropped_exr_is_placed_in_its_display_window(tmp_path):
+    image = random_image(4, 5, 1)
+    windows = {
+        "dataWindow": (np.array([3, -1], np.int32), np.array([7, 2], np.int32)),
+        "displayWindow": (np.array([1, 0], np.int32), np.array([6, 4], np.int32)),
+    }
+    write_exr_channels(tmp_path / "crop.exr", {"Y": np.ascontiguousarray(image[..., 0])}, **windows)
+    expected = np.zeros((5, 6, 1), np.float32)
+    expected[0:3, 2:6] = image[1:4, 0:4]
+    np.testing.assert_array_equal(read_image(tmp_path / "crop.exr")[0], expected)
+
+
+def test_exr_without_color_channels_is_refused_and_its_channels_named(tmp_path):
+    plane = np.ascontiguousarray(random_image(4, 4, 1)[..., 0])
+    write_exr_channels(tmp_path / "depth.exr", {"Z": plane, "left.R": plane})
+    with pytest.raises(ValueError, match=r"depth\.exr must have channels R, G, B or Y .* got .*left\.R"):
+        read_image(tmp_path / "depth.exr")
+
+
+@pytest.mark.parametrize(
+    "compression", [name for name in dir(OpenEXR) if name.endswith("_COMPRESSION") and not name.startswith("NUM")]
+)
+def test_every_compression_is_read_in_blocks_as_openexr_reads_it(tmp_path, compression):
+    """700 rows are three blocks of DWAB, the coarsest, and of ours."""
+    smooth = np.sin(np.arange(700)[:, None] / 40 + np.arange(9) / 3) + 2
+    image = np.stack([smooth, smooth**2, 1 / smooth], -1).astype(np.float16)
+    path = tmp_path / "image.exr"
+    try:
+        write_exr_channels(path, planes(image), compression=getattr(OpenEXR, compression))
+    except (RuntimeError, ValueError):
+        pytest.skip(f"this build of OpenEXR does not write {compression}")
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        expected = np.stack([file.channels()[name].pixels for name in "RGB"], -1).astype(np.float32)
+    np.testing.assert_array_equal(read_image(path)[0], expected)
+
+
+@pytest.mark.parametrize("tile", [(16, 16), (64, 48), (7, 300)])
+def test_tiles_of_any_shape_are_read(tmp_path, tile):
+    image = random_image(290, 50, 4).astype(np.float16).astype(np.float32)
+    write_tiles(tmp_path / "image.exr", image, tile)
+    np.testing.assert_array_equal(read_image(tmp_path / "image.exr")[0], image)
+
+
+def test_whole_numbers_are_read_as_they_are(tmp_path):
+    write_exr_channels(tmp_path / "image.exr", {"Y": np.arange(12, dtype=np.uint32).reshape(3, 4)})
+    np.testing.assert_array_equal(read_image(tmp_path / "image.exr")[0][..., 0], np.arange(12).reshape(3, 4))
+
+
+def test_the_first_part_with_rgb_is_read_and_depth_is_no_color(tmp_path):
+    path, image = tmp_path / "image.exr", random_image(4, 6, 3)
+    depth = {"Z": image[..., 0] + 5}
+    gray = {"Y": image[..., 1] + 7}
+    for first in ({"depth": (depth, {})}, {"gray": (gray, {})}, {"depth": (depth, {}), "gray": (gray, {})}):
+        write_parts(path, **first, beauty=(planes(image), {}))
+        read, attributes = read_image(path)
+        np.testing.assert_array_equal(read, image)
+        assert attributes["name"] == "beauty"
+    write_parts(path, depth=(depth, {}), gray=(gray, {}))
+    np.testing.assert_array_equal(read_image(path)[0][..., 0], gray["Y"])
+
+
+def test_parts_that_are_ignored_though_they_have_colors_are_named(tmp_path):
+    path, image = tmp_path / "image.exr", random_image(4, 6, 3)
+    write_parts(path, left=(planes(image), {}), depth=({"Z": image[..., 0]}, {}), right=(planes(image[::-1]), {}))
+    with pytest.warns(UserWarning, match=r"image\.exr has colors in several parts: 'left' is used, 'right' ignored"):
+        read = read_image(path)[0]
+    np.testing.assert_array_equal(read, image)
+
+
+def test_each_part_has_a_data_window_of_its_own(tmp_path):
+    path, image = tmp_path / "image.exr", random_image(3, 4, 3)
+    display = (np.array([0, 0], np.int32), np.array([7, 5], np.int32))
+    window = (np.array([2, 1], np.int32), np.array([5, 3], np.int32))
+    whole = {"displayWindow": display, "dataWindow": display}
+    write_parts(
+        path,
+        depth=({"Z": random_image(6, 8)}, whole),
+        beauty=(planes(image), {"displayWindow": display, "dataWindow": window}),
+    )
+    expected = np.zeros((6, 8, 3), np.float32)
+    expected[1:4, 2:6] = image
+    np.testing.assert_array_equal(read_image(path)[0], expected)
+
+
+def test_layers_are_named_where_there_is_no_other_color(tmp_path):
+    image = random_image(4, 6, 3)
+    write_exr_channels(tmp_path / "a.exr", planes(image, prefix="diffuse.") | planes(image, prefix="specular.left."))
+    with pytest.raises(ValueError, match=r"a\.exr must have .* got diffuse\.B.*layers diffuse, specular\.left have"):
+        read_image(tmp_path / "a.exr")
+    write_exr_channels(tmp_path / "b.exr", planes(image) | planes(image + 1, prefix="diffuse."))
+    np.testing.assert_array_equal(read_image(tmp_path / "b.exr")[0], image)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"chromaticities": AP0},
+        {"chromaticities": AP0, "acesImageContainerFlag": 1, "whiteLuminance": 80.0},
+        {"acesImageContainerFlag": 1},
+    ],
+    ids=["chromaticities", "both", "container"],
+)
+def test_aces_colors_become_rec709(tmp_path, header):
+    image = random_image(5, 6, 4) * 30
+    write_exr_channels(tmp_path / "image.exr", planes(image, "RGBA"), **header)
+    read = read_image(tmp_path / "image.exr")[0]
+    np.testing.assert_allclose(read[..., :3], image[..., :3] @ AP0_TO_REC709.T, atol=30 * 4 * MATRIX_ERROR)
+    np.testing.assert_array_equal(read[..., 3], image[..., 3])
+
+
+@pytest.mark.skipif(not hasattr(OpenEXR, "colorInteropIDToChromaticities"), reason="OpenEXR 3.5")
+def test_color_interop_ids_are_used_where_there_are_no_chromaticities(tmp_path):
+    image = random_image(5, 6, 3)
+    for name, expected in (("lin_ap0_scene", image @ AP0_TO_REC709.T), ("lin_rec709_scene", image), ("data", image)):
+        write_exr_channels(tmp_path / "image.exr", planes(image), colorInteropID=name)
+        np.testing.assert_allclose(read_image(tmp_path / "image.exr")[0], expected, atol=4 * MATRIX_ERROR)
+
+
+def test_chromaticities_of_the_first_part_hold_for_the_others(tmp_path):
+    image = random_image(5, 6, 3)
+    write_parts(
+        tmp_path / "image.exr",
+        depth=({"Z": image[..., 0]}, {"chromaticities": AP0}),
+        beauty=(planes(image), {"chromaticities": AP0}),
+    )
+    read = read_image(tmp_path / "image.exr")[0]
+    np.testing.assert_allclose(read, image @ AP0_TO_REC709.T, atol=4 * MATRIX_ERROR)
+
+
+def test_gray_and_rec709_are_left_as_they_are(tmp_path):
+    image = random_image(5, 6, 3) - 0.5
+    rec709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
+    write_exr_channels(tmp_path / "a.exr", planes(image), chromaticities=rec709)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.exr")[0], image)
+    write_exr_channels(tmp_path / "b.exr", planes(image, "Y"), chromaticities=AP0)
+    np.testing.assert_array_equal(read_image(tmp_path / "b.exr")[0], image[..., :1])
+
+
+def test_chromaticities_that_span_no_colors_are_refused(tmp_path):
+    for wrong in ((0.0,) * 8, (0.3, 0.3) * 4, (*AP0[:6], 0.3, 0.0), (*AP0[:7], float("nan"))):
+        write_exr_channels(tmp_path / "image.exr", planes(random_image(2, 2, 3)), chromaticities=wrong)
+        with pytest.raises(ValueError, match=r"the chromaticities of .*image\.exr must state primaries"):
+            read_image(tmp_path / "image.exr")
+
+
+def windows(path, *corners):
+    """Overwrites the data window and the display window of a file."""
+    data = bytearray(path.read_bytes())
+    for name, corner in zip((b"dataWindow", b"displayWindow"), corners, strict=True):
+        place = data.index(name + b"\0box2i\0") + len(name) + 11
+        data[place : place + 16] = np.array(corner, "<i4").tobytes()
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("tiled", [False, True])
+def test_windows_of_too_many_pixels_are_refused_by_the_header(tmp_path, tiled):
+    path, image = tmp_path / "image.exr", random_image(8, 16, 3)
+    small = (0, 0, 15, 7)
+    for data, display, size in (
+        (small, (0, 0, 49_999, 39_999), "50000 x 40000"),
+        ((0, 0, 2**30, 2**29), small, "1073741825 x 536870913"),
+        ((0, 0, 0, 2**31 - 1), small, "1 x 2147483648"),
+        (small, (-(2**31), -(2**31), 2**31 - 1, 2**31 - 1), "4294967296 x 4294967296"),
+    ):
+        write_tiles(path, image, (8, 8)) if tiled else write_exr(path, image)
+        windows(path, data, display)
+        with pytest.raises(ValueError, match=rf"image\.exr must .*({size}|undamaged)"):
+            read_image(path)
+    write_tiles(path, image, (8, 8)) if tiled else write_exr(path, image)
+    windows(path, small, (0, 0, 20_000, 10_000))  # Only the display window needs memory, 2.4 GB.
+    free = read_free(path)
+    assert free > 2.4e9
+
+
+def read_free(path):
+    """Smallest memory with which an image is read."""
+    needed = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "jaxprt.require.memory", lambda what, size, *_: needed.append(size) or (_ for _ in ()).throw(MemoryError)
+        )
+        with pytest.raises(MemoryError):
+            read_image(path)
+    return needed[-1]
+
+
+def test_rows_of_tall_tiles_count_before_they_are_read(tmp_path):
+    image = np.zeros((2048, 32, 3), np.float32)
+    write_tiles(tmp_path / "flat.exr", image, (8, 8))
+    write_tiles(tmp_path / "tall.exr", image, (8, 2048))
+    rows = image[256:].nbytes
+    assert rows < read_free(tmp_path / "tall.exr") - read_free(tmp_path / "flat.exr") < 2 * rows
+
+
+def again(count):
+    return bytes([1, 1, 1, count])
+
+
+def picture(data, width, height=1, *, head=HEAD, resolution=None):
+    return head + b"\n" + (resolution or b"-Y %d +X %d" % (height, width)) + b"\n" + data
+
+
+def read(data, width, height=1, **more):
+    return decode_image(picture(data, width, height, **more), name="sky.hdr")
+
+
+def values(*pixels):
+    return np.array([VALUE[pixel] for pixel in pixels])
+
+
+def test_pixels_have_the_values_of_ward():
+    assert read(RED + SKY, 2).dtype == np.float32
+    np.testing.assert_array_equal(read(RED + SKY, 2)[0], values(RED, SKY))
+    np.testing.assert_array_equal(read(bytes([255, 255, 255, 0]), 1)[0, 0], 0)
+    np.testing.assert_array_equal(read(bytes([255, 1, 0, 255]), 1)[0, 0], [255 * 2.0**119, 2.0**119, 0])
+    np.testing.assert_array_equal(
+        read(bytes([128, 1, 0, 1]), 1)[0, 0], np.ldexp([128.0, 1, 0], -135).astype(np.float32)
+    )
+
+
+def test_old_runs_repeat_the_pixel_before_them():
+    np.testing.assert_array_equal(read(RED + again(3) + SKY, 5)[0], values(RED, RED, RED, RED, SKY))
+    np.testing.assert_array_equal(read(RED + SKY + again(2), 4)[0], values(RED, SKY, SKY, SKY))
+    np.testing.assert_array_equal(read(RED + again(0) + SKY, 2)[0], values(RED, SKY))
+    # A pixel after a run ends it: the next run starts at the lowest digit.
+    np.testing.assert_array_equal(
+        read(RED + again(1) + SKY + again(2) + RED, 6)[0], values(RED, RED, SKY, SKY, SKY, RED)
+    )
+
+
+def test_consecutive_old_runs_are_the_digits_of_a_number_to_the_base_256():
+    for digits in ((44, 1), (0, 1), (255,), (0, 0, 1), (7, 2, 1), (5, 0, 0, 0, 0)):
+        count = sum(digit * 256**i for i, digit in enumerate(digits))
+        row = read(RED + b"".join(map(again, digits)) + SKY, count + 2)[0]
+        np.testing.assert_array_equal(row[:-1], np.broadcast_to(VALUE[RED], (count + 1, 3)))
+        np.testing.assert_array_equal(row[-1], VALUE[SKY])
+
+
+def test_old_runs_start_anew_in_each_line():
+    data = RED + again(9) + SKY + again(4) + RED + again(4) + b"".join([RED] * 10)
+    expected = np.stack([values(*[RED] * 10), values(*[SKY] * 5, *[RED] * 5), values(*[RED] * 10)])
+    np.testing.assert_array_equal(read(data, 10, 3), expected)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        RED + again(10) + SKY + again(8),  # over the end of a line
+        RED + again(9) + SKY + again(8),  # too few
+        RED + again(9) + again(9),  # a line that starts with a run
+        again(9) + RED + again(9),
+        RED + again(9) + SKY + again(9)[:3],
+        RED + again(0) + again(0) + again(0) + again(0) + again(0) + again(1),
+        RED + b"".join(map(again, [255] * 40)),
+        RED * 19,
+        b"",
+    ],
+)
+def test_runs_that_do_not_fill_the_lines_are_refused(data):
+    with pytest.raises(
+        ValueError, match=r"sky\.hdr must be an undamaged hdr file, got pixels or runs .* 2 lines of 10"
+    ):
+        read(data, 10, 2)
+
+
+def test_runs_longer_than_the_picture_take_no_memory():
+    with pytest.raises(ValueError, match="do not fill"):
+        read(RED + b"".join(map(again, [255, 255, 255, 255])), 10, 2)
+
+
+def test_flat_pixels_that_look_like_runs_are_pixels_where_the_file_has_all_of_them():
+    data = bytes([1, 1, 1, 129]) + RED * 19
+    np.testing.assert_array_equal(read(data, 10, 2)[0, 0], np.full(3, 2 / 256))
+
+
+def component_runs(image):
+    """The newer coding of a line: each component by itself, here a run of its first half, and the rest as it is."""
+    data = b""
+    for line in image:
+        width = len(line)
+        data += bytes([2, 2]) + struct.pack(">H", width)
+        for component in line.T:
+            half = width // 2
+            data += bytes([128 + half, component[0], width - half]) + component[half:].tobytes()
+    return data
+
+
+def coded(stored, coding):
+    """Pixels [h, w, 4] whose lines have equal pixels in their first half."""
+    if coding == "flat":
+        return stored.tobytes()
+    if coding == "runs":
+        return component_runs(stored)
+    half = stored.shape[1] // 2
+    return b"".join(line[0].tobytes() + again(half - 1) + line[half:].tobytes() for line in stored)
+
+
+def blocks(height, width, seed=0):
+    mantissa = np.random.default_rng(seed).integers(128, 256, (height, width, 3))
+    stored = np.concatenate([mantissa, np.full((height, width, 1), 129)], -1).astype(np.uint8)
+    stored[:, : width // 2] = stored[:, :1]
+    return stored
+
+
+# What the resolution line says of the rows and columns of the picture, from Radiance's description of its files: the
+# first axis is the one between scan lines, -Y is downwards, +X is to the right.
+TURNED = {
+    b"-Y 6 +X 10": lambda lines: lines,
+    b"-Y 6 -X 10": lambda lines: lines[:, ::-1],
+    b"+Y 6 +X 10": lambda lines: lines[::-1],
+    b"+Y 6 -X 10": lambda lines: lines[::-1, ::-1],
+    b"+X 6 -Y 10": lambda lines: lines.transpose(1, 0, 2),
+    b"-X 6 -Y 10": lambda lines: lines.transpose(1, 0, 2)[:, ::-1],
+    b"+X 6 +Y 10": lambda lines: lines.transpose(1, 0, 2)[::-1],
+    b"-X 6 +Y 10": lambda lines: lines.transpose(1, 0, 2)[::-1, ::-1],
+}
+
+
+@pytest.mark.parametrize("coding", ["flat", "old runs", "runs"])
+@pytest.mark.parametrize("resolution", TURNED)
+def test_every_coding_is_read_in_every_orientation(coding, resolution):
+    stored = blocks(6, 10)
+    expected = TURNED[resolution](stored[..., :3] / 128.0)
+    np.testing.assert_array_equal(read(coded(stored, coding), 0, resolution=resolution), expected)
+
+
+def test_what_openimageio_reads_is_read_alike(tmp_path):
+    image = np.exp(4 * np.random.default_rng(0).normal(size=(40, 70, 3))).astype(np.float32)
+    path = tmp_path / "image.hdr"
+    assert OpenImageIO.ImageBuf(image).write(str(path))
+    expected = np.asarray(OpenImageIO.ImageBuf(str(path)).get_pixels("float"))
+    np.testing.assert_array_equal(read_image(path)[0], expected)
+
+
+@pytest.mark.parametrize("coding", ["flat", "old runs", "runs"])
+def test_radiance_is_the_pixel_divided_by_all_exposures_and_color_corrections(coding):
+    stored = blocks(2, 8)
+    expected = stored[..., :3] / 128.0
+    for lines, factor in (
+        (b"EXPOSURE=2\n", 1 / 2),
+        (b"EXPOSURE= 2.0\nVIEW= -vp 0 0 0\nEXPOSURE=4e0\n", 1 / 8),
+        (b"EXPOSURE=0.25\n\tEXPOSURE=7\n EXPOSURE=9\n", 4),  # Indented lines are about other pictures.
+        (b"COLORCORR= 1 2 4\n", [1, 1 / 2, 1 / 4]),
+        (b"COLORCORR=1 2 4\nEXPOSURE=.5\nCOLORCORR=2 1 1\n", [1, 1, 1 / 2]),
+        (b"EXPOSURE=1\nSOFTWARE=EXPOSURE=3\n#EXPOSURE=3\n", 1),
+    ):
+        read_pixels = read(coded(stored, coding), 8, 2, head=HEAD + lines)
+        np.testing.assert_allclose(read_pixels, expected * factor, rtol=1e-7)
+
+
+def test_the_variables_of_the_header_are_returned(tmp_path):
+    path = tmp_path / "a.hdr"
+    head = b"#?RGBE\nSOFTWARE=one = two\nEXPOSURE=2\nEXPOSURE=4\nCOLORCORR=1 1 2\n"
+    path.write_bytes(picture(RED, 1, head=head))
+    attributes = read_image(path)[1]
+    assert attributes == {"SOFTWARE": "one = two", "EXPOSURE": 8.0, "COLORCORR": (1.0, 1.0, 2.0)}
+
+
+@pytest.mark.parametrize(
+    "line", ["EXPOSURE=", "EXPOSURE=0", "EXPOSURE=-1", "EXPOSURE=nan", "EXPOSURE=two", "COLORCORR=1 1", "GAMMA=x"]
+)
+def test_headers_with_impossible_numbers_are_refused(line):
+    with pytest.raises(ValueError, match=f"{line.split('=')[0]} of sky.hdr must be"):
+        read(RED, 1, head=HEAD + line.encode() + b"\n")
+
+
+def test_exposures_whose_product_overflows_are_refused():
+    for value in (b"1e30", b"1e-30"):
+        with pytest.raises(ValueError, match=r"exposures of sky\.hdr must give finite radiance"):
+            read(RED, 1, head=HEAD + b"EXPOSURE=" + value + b"\nEXPOSURE=" + value + b"\n")
+
+
+def test_primaries_become_rec709():
+    """Those of Rec. 2020, by the matrix of ITU-R BT.2087; white stays white for any."""
+    primaries = b"PRIMARIES= 0.708 0.292 0.170 0.797 0.131 0.046 0.3127 0.3290\n"
+    published = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]])
+    row = read(RED + SKY, 2, head=HEAD + primaries)[0]
+    np.testing.assert_allclose(row, values(RED, SKY) @ published.T, atol=4e-4)
+    equal_energy = b"PRIMARIES=.640 .330 .290 .600 .150 .060 .333333 .333333\n"
+    np.testing.assert_allclose(read(bytes([128, 128, 128, 129]), 1, head=HEAD + equal_energy)[0, 0], 1, rtol=1e-6)
+    rec709 = b"PRIMARIES=.64 .33 .30 .60 .15 .06 .3127 .3290\n"
+    np.testing.assert_array_equal(read(RED + SKY, 2, head=HEAD + rec709)[0], values(RED, SKY))
+    unstated = b"PRIMARIES=0 0 0 0 0 0 0 0\n"
+    np.testing.assert_array_equal(read(RED + SKY, 2, head=HEAD + unstated)[0], values(RED, SKY))
+    for wrong in (b"1 2 3", b"0 0 0 0 0 0 0 1", b"a b c d e f g h"):
+        with pytest.raises(ValueError, match=r"PRIMARIES of sky\.hdr must"):
+            read(RED, 1, head=HEAD + b"PRIMARIES=" + wrong + b"\n")
+
+
+def test_gamma_is_ignored_with_a_warning():
+    with pytest.warns(UserWarning, match=r"sky\.hdr states GAMMA=2\.2, which is ignored"):
+        read(RED, 1, head=HEAD + b"GAMMA=2.2\n")
+    read(RED, 1, head=HEAD + b"GAMMA=1.0\n")
+
+
+def test_line_ends_of_other_systems_and_missing_formats_are_read():
+    np.testing.assert_array_equal(read(RED, 1, head=b"#?RADIANCE\n")[0], values(RED))
+    data = b"#?RADIANCE\r\nFORMAT=32-bit_rle_rgbe\r\nEXPOSURE=2\r\n\r\n-Y 1 +X 2\r\n" + RED + SKY
+    np.testing.assert_array_equal(decode_image(data, name="a")[0], values(RED, SKY) / 2)
+
+
+def test_formats_and_resolutions_of_other_kinds_are_refused():
+    for form in (b"32-bit_rle_xyze", b"Radiance_spectra"):
+        with pytest.raises(ValueError, match=rf"sky\.hdr must hold RGB .*, got {form.decode()}: convert it first"):
+            read(RED, 1, head=b"#?RADIANCE\nFORMAT=" + form + b"\n")
+    for resolution in (b"-Y 1 +Y 1", b"-Y 1", b"", b"-Z 1 +X 1", b"-Y -1 +X 1", b"-Y 9999999999 +X 1", b"-Y 1 +X 1 1"):
+        with pytest.raises(ValueError, match=r"sky\.hdr must be an undamaged hdr file with a resolution"):
+            read(RED, 1, resolution=resolution or b" ")
+    for size in (b"-Y 0 +X 4", b"-Y 60000 +X 60000"):
+        with pytest.raises(ValueError, match=r"sky\.hdr must have 1 to 268435456 pixels"):
+            read(RED, 1, resolution=size)
+
+
+def test_pictures_that_do_not_fit_into_memory_are_refused(monkeypatch):
+    data = coded(blocks(100, 200), "old runs")
+    monkeypatch.setattr(require, "available_memory", lambda: 34_000_000)  # 33.55 MB are for blocks.
+    with pytest.raises(MemoryError, match=r"sky\.hdr: 200 x 100 pixels"):
+        read(data, 200, 100)

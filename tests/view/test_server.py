@@ -1,11 +1,32 @@
-"""The server: its page and answers for who has the token, on this machine, and nothing for others."""
+"""The server: its page and answers for who has the token, on this machine, and nothing for others.
+
+Requests of wrong form: each is answered by a status and words, and the server goes on.
+
+The session behind the server answers without computing anything, so that the tests compile nothing.
+
+The address by which the browser comes: through a tunnel or a proxy, and not by names that others point here.
+"""
 
 import http.client
+import json
+import socket
+import struct
+import threading
 import urllib.parse
 
 import pytest
+from click.testing import CliRunner
 
+from jaxprt.cli import play
 from jaxprt.view import Server, messages
+from jaxprt.view.server import parse
+from tests.view.peers import Echo, Proxy, exchange
+
+WAYS = {
+    "a tunnel": {},
+    "a path that the proxy removes": {"path": "/user/me/proxy/8765"},
+    "a proxy that names the server": {"path": "/p", "host": "127.0.0.1:{port}"},
+}
 
 
 @pytest.fixture
@@ -91,3 +112,356 @@ def test_tokens_differ_and_ports_come_back(session):
     first.close()
     second.close()
     Server(session, port=port).close()
+
+
+@pytest.fixture(scope="module")
+def echo():
+    made = Server(Echo())
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Short patience with slow clients."""
+    monkeypatch.setattr("jaxprt.view.server._BODY", 0.4)
+    monkeypatch.setattr("jaxprt.view.server._SLOWEST", 1e9)
+
+
+def raw_request(made, *, method="POST", path="ask", host=None, body=b"", length=True, extra=()):
+    """The bytes of a request."""
+    place = urllib.parse.urlsplit(made.url)
+    lines = [f"{method} {place.path}{path} HTTP/1.1"]
+    lines += [f"Host: {place.netloc}" if host is None else host] if host != "" else []
+    lines += [f"Content-Length: {len(body)}"] if length else []
+    return "\r\n".join([*lines, "Connection: close", *extra, "", ""]).encode("latin-1") + body
+
+
+def alive(made):
+    status, _ = exchange(made, raw_request(made, body=messages.pack({"kind": "scene"}, [])))
+    return status == 200
+
+
+LOCAL = "Host: 127.0.0.1:{port}"
+GOOD = messages.pack({"kind": "look"}, [])
+HTTP = {
+    "a length of 5,000 digits": ({"extra": ["Content-Length: " + "9" * 5000], "length": False}, 413, "at most"),
+    "a length of 5,000 zeros": ({"extra": ["Content-Length: " + "0" * 5000], "length": False}, 413, "at most"),
+    "a negative length": ({"extra": ["Content-Length: -5"], "length": False}, 400, "whole number, got '-5'"),
+    "a signed length": ({"extra": ["Content-Length: +5"], "length": False}, 400, "whole number"),
+    "a length in words": ({"extra": ["Content-Length: ten"], "length": False}, 400, "got 'ten'"),
+    "a length in superscript": ({"extra": ["Content-Length: \xb2"], "length": False}, 400, "whole number"),
+    "an empty length": ({"extra": ["Content-Length: "], "length": False}, 400, "whole number, got ''"),
+    "a fraction of a byte": ({"extra": ["Content-Length: 1.5"], "length": False}, 400, "got '1.5'"),
+    "two lengths": ({"extra": ["Content-Length: 3"], "body": GOOD}, 400, "must have one Content-Length"),
+    "a list of lengths": ({"extra": ["Content-Length: 3, 3"], "length": False}, 400, "whole number, got '3, 3'"),
+    "no length": ({"length": False}, 411, "must state its length by Content-Length alone, got none"),
+    "chunks": (
+        {"extra": ["Transfer-Encoding: chunked"], "length": False, "body": b"3\r\nabc\r\n0\r\n\r\n"},
+        411,
+        "got Transfer-Encoding 'chunked'",
+    ),
+    "chunks and a length": ({"extra": ["Transfer-Encoding: chunked"], "body": GOOD}, 400, "Transfer-Encoding"),
+    "a length before a space": ({"extra": ["Content-Length : 3"], "length": False}, 400, "headers of the right form"),
+    "a terabyte": ({"extra": [f"Content-Length: {10**12}"], "length": False}, 413, f"got {10**12}"),
+    "two hosts": ({"extra": ["Host: example.org"], "body": GOOD}, 400, "one Host"),
+    "the same host twice": ({"extra": [LOCAL], "body": GOOD}, 400, "one Host"),
+    "no host": ({"host": "", "body": GOOD}, 400, "one Host"),
+    "an empty host": ({"host": "Host: ", "body": GOOD}, 403, "with the Host ''"),
+    "another host": ({"host": "Host: example.org:80", "body": GOOD}, 403, "with the Host 'example.org:80'"),
+    "a host of letters beyond ASCII": ({"host": "Host: \xe9\xe8", "body": GOOD}, 403, r"Host '\xe9\xe8'"),
+    "two origins": (
+        {"extra": ["Origin: http://a.org", "Origin: http://b.org"], "body": GOOD},
+        400,
+        "at most one Origin",
+    ),
+    "another origin": ({"extra": ["Origin: https://a.org"], "body": GOOD}, 403, "with the Origin 'https://a.org'"),
+    "a header without a colon": ({"extra": ["Nonsense"], "body": GOOD}, 400, "headers of the right form"),
+    "a header of 100 kB": ({"extra": ["X: " + "a" * 100_000], "body": GOOD}, 431, "Line too long"),
+    "200 headers": ({"extra": [f"X{number}: a" for number in range(200)], "body": GOOD}, 431, "Too many headers"),
+    "a path of 100 kB": ({"path": "a" * 100_000, "body": GOOD}, 414, "Too Long"),
+    "an unknown method": ({"method": "BREW", "body": GOOD}, 405, "Unsupported method"),
+    "a page with a body": ({"method": "GET", "path": "", "body": b"abc"}, 400, "must have no body"),
+    "another page": ({"path": "other", "body": GOOD}, 404, "no such page"),
+    "a path upwards": ({"path": "../../etc/passwd", "method": "GET"}, 404, "no such page"),
+}
+
+
+@pytest.mark.parametrize("case", HTTP)
+def test_requests_of_wrong_form_get_a_status_and_words(echo, case):
+    options, status, words = HTTP[case]
+    port = str(urllib.parse.urlsplit(echo.url).port)
+    options = options | {"extra": [line.replace("{port}", port) for line in options.get("extra", ())]}
+    found, text = exchange(echo, raw_request(echo, **options))
+    assert (found, words in text) == (status, True), text
+    assert urllib.parse.urlsplit(echo.url).path.strip("/") not in text  # the token
+    assert alive(echo)
+
+
+@pytest.mark.parametrize(
+    ("data", "status"),
+    [
+        (b"\r\n\r\n", None),
+        (b"hello\r\n\r\n", 400),
+        (b"GET\r\n\r\n", 400),
+        (b"GET / HTTP/9.9\r\n\r\n", 400),
+        (b"GET / HTTP/x\r\n\r\n", 400),
+        (b"GET /\r\n\r\n", 400),
+        (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n", 400),  # TLS
+        (b"POST / HTTP/1.1\r\n\r\n", 400),
+    ],
+)
+def test_bytes_that_are_no_request_are_refused(echo, data, status):
+    if status is not None:
+        assert exchange(echo, data)[0] == status
+    assert alive(echo)
+
+
+def body(text, length=None):
+    head = text if isinstance(text, bytes) else text.encode()
+    return struct.pack("<I", len(head) if length is None else length) + head
+
+
+DEEP = "[" * 100_000
+BODIES = {
+    "empty": (b"", "in another form"),
+    "short": (b"abc", "in another form"),
+    "a length beyond the end": (body('{"content": {}, "lengths": []}', 2**32 - 1), "in another form"),
+    "no JSON": (body("hello"), "in another form"),
+    "no UTF-8": (body(b'{"content": {"kind": "\xff\xfe"}, "lengths": []}'), "in another form"),
+    "a list": (body("[]"), "in another form"),
+    "no content": (body('{"lengths": []}'), "in another form"),
+    "content of pairs": (body('{"content": [["kind", "look"]], "lengths": []}'), "`content`"),
+    "no lengths": (body('{"content": {}}'), "in another form"),
+    "lengths of text": (body('{"content": {}, "lengths": "12"}'), "`lengths`"),
+    "a negative array": (body('{"content": {}, "lengths": [-1]}'), "an array has -1 bytes"),
+    "an array beyond the end": (body('{"content": {}, "lengths": [8]}'), "an array has 8 bytes"),
+    "an array of true bytes": (body('{"content": {}, "lengths": [true]}'), "an array has True bytes"),
+    "nested lists": (body('{"content": {"kind": ' + DEEP), "in another form"),
+    "an integer beyond float64": (
+        body('{"content": {"kind": "look", "turn": 1' + "0" * 400 + '}, "lengths": []}'),
+        "in the range of float64",
+    ),
+    "an integer of 5,000 digits": (
+        body('{"content": {"turn": ' + "9" * 5000 + '}, "lengths": []}'),
+        "in the range of float64, got 9999",
+    ),
+    "a float beyond float64": (body('{"content": {"turn": 1e999}, "lengths": []}'), "must be finite, got 1e999"),
+    "not a number": (body('{"content": {"turn": NaN}, "lengths": []}'), "must be finite, got NaN"),
+    "infinity": (body('{"content": {"turn": -Infinity}, "lengths": []}'), "must be finite, got -Infinity"),
+}
+
+
+@pytest.mark.parametrize("case", BODIES)
+def test_messages_of_wrong_form_get_400_and_words(echo, case):
+    data, words = BODIES[case]
+    status, text = exchange(echo, raw_request(echo, body=data))
+    assert (status, words in text) == (400, True), text
+    assert alive(echo)
+
+
+def test_an_answer_that_is_an_error_has_the_status_400_and_its_words(echo):
+    place = urllib.parse.urlsplit(echo.url)
+    with socket.create_connection((place.hostname or "", place.port or 0)) as connection:
+        connection.sendall(raw_request(echo, body=messages.pack({"kind": "wrong"}, [])))
+        answer = b"".join(iter(lambda: connection.recv(1 << 16), b""))
+    head, _, data = answer.partition(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 400 ")
+    assert messages.unpack(data)[0]["message"] == "what was required"
+
+
+@pytest.mark.parametrize("kind", ["fault", "nothing"])
+def test_a_fault_of_the_viewer_is_told_and_the_server_goes_on(echo, kind):
+    status, text = exchange(echo, raw_request(echo, body=messages.pack({"kind": kind}, [])))
+    assert (status, "the viewer failed" in text) == (500, True)
+    assert alive(echo)
+
+
+def test_a_message_that_stops_is_refused(echo, quick):
+    whole = raw_request(echo, body=messages.pack({"kind": "look"}, []))
+    status, text = exchange(echo, whole[:-3])
+    assert (status, "bytes that it states" in text) == (400, True)
+    status, text = exchange(echo, whole[:-3], end=False)
+    assert (status, "must arrive within 0.4 seconds" in text) == (408, True)
+
+
+def test_a_message_that_dribbles_is_refused_and_others_are_served_meanwhile(echo, quick):
+    whole = raw_request(echo, body=messages.pack({"kind": "look"}, [bytes(64)]))
+    found = []
+    slow = threading.Thread(
+        target=lambda: found.append(
+            exchange(echo, whole[:-40], parts=[whole[k : k + 1] for k in range(-40, -30)], wait=0.1, end=False)
+        )
+    )
+    slow.start()
+    assert alive(echo)
+    slow.join()
+    assert found[0][0] == 408
+
+
+def test_a_large_message_is_refused_by_the_free_memory_before_it_is_read(echo, monkeypatch):
+    monkeypatch.setattr(messages.require, "available_memory", lambda: 4 << 26)
+    status, text = exchange(echo, raw_request(echo, length=False, extra=[f"Content-Length: {1 << 27}"]), end=False)
+    assert (status, f"at most {1 << 26} bytes" in text) == (413, True)
+    data = messages.pack({"kind": "drop"}, [bytes(1 << 20)])
+    status, text = exchange(echo, raw_request(echo, body=data))
+    assert (status, "[1048576]" in text) == (200, True)
+
+
+def test_several_messages_go_over_one_connection(echo):
+    whole = raw_request(echo, body=GOOD).replace(b"Connection: close\r\n", b"")
+    last = raw_request(echo, body=GOOD)
+    place = urllib.parse.urlsplit(echo.url)
+    with socket.create_connection((place.hostname or "", place.port or 0)) as connection:
+        connection.sendall(whole + whole + last)
+        answer = b"".join(iter(lambda: connection.recv(1 << 16), b""))
+    assert answer.count(b"HTTP/1.1 200 ") == 3
+
+
+def test_integers_beyond_float64_are_refused_by_name_in_notebooks_too():
+    with pytest.raises(ValueError, match="turn must be a finite number, got an integer of 1329 bits"):
+        messages.number({"turn": 10**400}, "turn", 0.0, 1.0)
+    assert json.loads(json.dumps(1 << 999)) == messages.number({"turn": 1 << 999}, "turn", 0.0, float("inf"))
+
+
+@pytest.fixture(params=WAYS)
+def proxied(request):
+    """A proxy, and a server behind it."""
+    proxy = Proxy(**WAYS[request.param])
+    made = Server(Echo(), address=proxy.address)
+    proxy.target = made._server.server_port
+    yield proxy, made
+    made.close()
+    proxy.shutdown()
+    proxy.server_close()
+
+
+def ask(url, *, method="POST", data: bytes | None = GOOD, headers=None, **more):
+    """Status and bytes of an answer."""
+    place = urllib.parse.urlsplit(url)
+    connection = http.client.HTTPConnection(place.hostname or "", place.port, timeout=60)
+    connection.request(method, place.path, data, {**(headers or {}), **more})
+    answer = connection.getresponse()
+    found = answer.status, answer.read()
+    connection.close()
+    return found
+
+
+def test_the_page_and_its_messages_come_through_a_proxy(proxied):
+    proxy, made = proxied
+    assert made.url.startswith(f"{proxy.address}/")
+    status, page = ask(made.url, method="GET", data=None)
+    assert status == 200
+    # Whatever the page loads is relative to it.
+    for inner in (b'"./viewer.js"', b'"./ask"'):
+        assert inner in page
+    assert ask(f"{made.url}viewer.js", method="GET", data=None)[0] == 200
+    origin = proxy.address.removesuffix(proxy.path)
+    status, data = ask(f"{made.url}ask", Origin=origin)
+    assert (status, messages.unpack(data)[0]["kind"]) == (200, "color")
+
+
+def test_other_origins_hosts_and_tokens_are_refused_through_a_proxy(proxied):
+    proxy, made = proxied
+    origin = proxy.address.removesuffix(proxy.path)
+    for wrong in ("http://evil.example", "null", f"{origin}.evil.example", origin.replace("http:", "https:")):
+        status, data = ask(f"{made.url}ask", Origin=wrong)
+        assert (status, wrong in data.decode()) == (403, True)
+    if proxy.host is None:
+        for wrong in (
+            "evil.example",
+            f"localhost:{proxy.server_port + 1}",
+            f"localhost:{proxy.server_port}.evil.example",
+        ):
+            status, data = ask(f"{made.url}ask", Host=wrong)
+            assert (status, wrong in data.decode()) == (403, True)
+    assert ask(f"{proxy.address}/wrong-token/ask", Origin=origin)[0] == 403
+    assert ask(f"{proxy.address}/ask", Origin=origin)[0] == 403
+
+
+def test_a_proxy_that_keeps_its_path_is_served_too():
+    made = Server(Echo(), address="https://hub.example.org/user/me/proxy/absolute/8765/")
+    token = urllib.parse.urlsplit(made.url).path.split("/")[-2]
+    assert made.url == f"https://hub.example.org/user/me/proxy/absolute/8765/{token}/"
+    local = f"http://127.0.0.1:{made._server.server_port}"
+    for path, status in (("/user/me/proxy/absolute/8765", 200), ("", 200), ("/user/me", 403)):
+        for host in ("hub.example.org", "hub.example.org:443", "HUB.example.org"):
+            headers = {"Host": host, "Origin": "https://hub.example.org"}
+            assert ask(f"{local}{path}/{token}/ask", headers=headers)[0] == status
+    assert ask(f"{local}/{token}/ask", Host="hub.example.org:80", Origin="https://hub.example.org")[0] == 403
+    assert ask(f"{local}/{token}/ask")[0] == 200  # this machine is served as before
+    made.close()
+
+
+def test_the_refusal_says_which_host_came_which_are_served_and_which_option_helps():
+    made = Server(Echo())
+    port, token = made._server.server_port, urllib.parse.urlsplit(made.url).path
+    head = f"POST {token}ask HTTP/1.1\r\nHost: localhost:9000\r\nContent-Length: 0\r\n\r\n"
+    status, words = exchange(made, head.encode())
+    assert status == 403
+    for part in ("Host 'localhost:9000'", f"127.0.0.1:{port}, localhost:{port}", "address=URL", "--address URL"):
+        assert part in words
+    made.close()
+
+
+@pytest.mark.parametrize(
+    ("text", "hosts", "origin", "path"),
+    [
+        ("http://localhost:9000", ("localhost:9000",), "http://localhost:9000", ""),
+        ("http://localhost:9000/", ("localhost:9000",), "http://localhost:9000", ""),
+        ("https://Hub.Example.org/a/b/", ("hub.example.org", "hub.example.org:443"), "https://hub.example.org", "/a/b"),
+        ("https://hub.example.org:443", ("hub.example.org", "hub.example.org:443"), "https://hub.example.org", ""),
+        ("http://hub.example.org:443", ("hub.example.org:443",), "http://hub.example.org:443", ""),
+        ("http://[::1]:9000", ("[::1]:9000",), "http://[::1]:9000", ""),
+        ("http://10.0.0.5:80/x", ("10.0.0.5", "10.0.0.5:80"), "http://10.0.0.5", "/x"),
+    ],
+)
+def test_addresses_are_taken_apart_as_browsers_write_them(text, hosts, origin, path):
+    assert parse(text) == (f"{origin}{path}", hosts, origin, path)
+
+
+WRONG = [
+    "",
+    "localhost:9000",
+    "localhost",
+    "ftp://a",
+    "http://",
+    "http://*",
+    "http://a b",
+    "http://a/?x",
+    "http://a/#x",
+]
+WRONG += [
+    "http://user@a",
+    "http://a:port",
+    "http://a:70000",
+    "http://a/\r\nX: y",
+    "http://a\x00",
+    "//a",
+    "http://[a",
+    "*",
+]
+WRONG += ["http://a/<script>", "http://a/\u00e9", "http://.", "http://-", "javascript:alert(1)"]
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_what_is_no_address_is_refused_before_anything_is_computed(text, monkeypatch):
+    with pytest.raises(ValueError, match="the address must be that in the browser's bar"):
+        parse(text)
+    with pytest.raises(ValueError, match="the address must be that"):
+        Server(Echo(), address=text)
+    monkeypatch.setattr(play, "ready", None)
+    found = CliRunner().invoke(play.command, ["--address", text])
+    assert "--address: the address must be that in the browser's bar" in str(found.exception)
+
+
+def test_the_command_line_prints_the_address_and_opens_no_browser(monkeypatch):
+    opened = []
+    monkeypatch.setattr(play.webbrowser, "open", opened.append)
+    monkeypatch.setattr(play, "ready", lambda given: ({}, {}))
+    monkeypatch.setattr(play, "serve", lambda made, environments, port, address: Server(Echo(), address=address))
+    monkeypatch.setattr(Server, "wait", lambda self: self.close())
+    found = CliRunner().invoke(play.command, ["--address", "http://localhost:9000"])
+    assert found.exception is None
+    assert "jaxprt: http://localhost:9000/" in found.output
+    assert not opened

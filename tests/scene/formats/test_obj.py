@@ -1,13 +1,19 @@
-"""OBJ files as other programs write them."""
+"""OBJ files as other programs write them.
+
+OBJ files with MTL materials.
+"""
 
 import codecs
+import warnings
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.files import write_png
+from jaxprt.files import images, write_png
 from jaxprt.scene import load_mesh, load_scene
 from jaxprt.scene.formats import mesh_file
+from jaxprt.scene.mesh import split
 
 TRIANGLE = "v 0 0 0\nv 0 0 1\nv 1 0 0\nf 1 2 3\n"
 POSITION = [[0, 0, 0], [0, 0, 1], [1, 0, 0]]
@@ -17,6 +23,9 @@ MARKS = {
     "utf-16-be": codecs.BOM_UTF16_BE,
     "utf-32-le": codecs.BOM_UTF32_LE,
 }
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+FACE = "f 1/1 2/2 3/3 4/4\n"
+IMAGE = np.array([[[1, 0, 0], [0, 1, 0]], [[0, 0, 1], [1, 1, 1]]], np.float32)  # Red, green; blue, white.
 
 
 def write(folder, text, name="scene.obj"):
@@ -184,3 +193,233 @@ def test_a_comment_that_ends_in_a_backslash_does_not_continue(tmp_path):
         write(tmp_path, "# C:\\models\\\n" + TRIANGLE.replace("v 0 0 1", "v 0 0 \\\n 1")), groups=False
     )
     np.testing.assert_array_equal(geometry.position, POSITION)
+
+
+def write_materials(folder, materials, lines="usemtl a\n" + FACE, name="scene"):
+    (folder / f"{name}.mtl").write_text(materials)
+    path = folder / f"{name}.obj"
+    path.write_text(f"mtllib {name}.mtl\n{SQUARE}{lines}")
+    return path
+
+
+def one(folder, statements):
+    (part,) = load_scene(write_materials(folder, f"newmtl a\n{statements}")).parts
+    return part
+
+
+def test_parts_are_the_materials_in_order_of_their_first_faces(tmp_path):
+    materials = "newmtl oak wood\nKd .1 .2 .3\nd 1\nTr 0.0\nKa 1 1 1\nnewmtl unused\nnewmtl steel\nPm 1\nPr .3\n"
+    lines = FACE + "usemtl steel\n" + FACE + "usemtl oak wood\n" + FACE + "usemtl steel\n" + FACE
+    path = write_materials(tmp_path, materials, lines)
+    scene = load_scene(path)
+    assert [part.name for part in scene.parts] == ["default", "steel", "oak wood"]
+    assert [len(part.mesh.face) for part in scene.parts] == [2, 4, 2]
+    for part, own in zip(scene.parts, split(load_mesh(path)), strict=True):
+        np.testing.assert_array_equal(part.mesh.position, own.position)
+    default, steel, wood = (part.material for part in scene.parts)
+    assert (float(steel.metallic), float(steel.roughness)) == (1, pytest.approx(0.3))
+    np.testing.assert_allclose(wood.base_color, [0.1, 0.2, 0.3], rtol=1e-6)
+    assert (float(wood.metallic), float(wood.specular)) == (0, 0)
+    np.testing.assert_array_equal(default.base_color, [0.5] * 3)
+
+
+@pytest.mark.parametrize("exponent", [0, 10, 500])
+def test_phong_becomes_the_microfacets_nearest_to_its_lobe(tmp_path, exponent):
+    material = one(tmp_path, f"Kd .5 .5 .5\nKs .2 .1 .04\nNs {exponent}\nNi 1.2\nillum 2\n").material
+    # A Beckmann distribution of width m is near a power 2 / m^2 - 2 of the cosine: Walter et al. 2007, section 5.2.
+    assert 2 / float(material.roughness) ** 4 - 2 == pytest.approx(exponent, abs=1e-2)
+    reflectance = ((material.ior - 1) / (material.ior + 1)) ** 2 * material.specular_color * material.specular
+    np.testing.assert_allclose(reflectance, [0.2, 0.1, 0.04], rtol=1e-5)
+    matte = one(tmp_path, f"Kd .5 .5 .5\nKs .2 .1 .04\nNs {exponent}\nillum 1\n").material
+    assert float(matte.specular) == 0
+
+
+def test_metallic_roughness_statements_come_before_phongs(tmp_path):
+    material = one(tmp_path, "Kd 1 1 1\nKs .5 .5 .5\nNs 250\nNi 1.45\nPr .25\nPm .5\nKe 2 1 0\nillum 2\n").material
+    assert (float(material.roughness), float(material.metallic)) == (0.25, 0.5)
+    assert float(material.ior) == pytest.approx(1.45)
+    np.testing.assert_array_equal(material.specular_color, [1] * 3)
+    np.testing.assert_array_equal(material.emissive, [2, 1, 0])
+
+
+def exported(folder, header, statements):
+    """The material of a file of Blender's, whose OBJ has a header."""
+    path = write_materials(folder, f"# Blender 0 MTL File: 'None'\nnewmtl a\n{statements}")
+    path.write_text(f"{header}\n{path.read_text()}")
+    (part,) = load_scene(path).parts
+    return part.material
+
+
+@pytest.mark.parametrize(
+    ("header", "exponent"),
+    [("# Blender 3.6.0", 1000), ("# Blender 4.2.1 LTS", 1000), ("# Blender v2.93.5 OBJ File: ''", 900)],
+)
+@pytest.mark.parametrize(("roughness", "specular", "metallic"), [(0.5, 0.5, 0), (0, 0.25, 1), (1, 1, 0.7), (0.3, 0, 0)])
+def test_materials_that_blender_exports_come_back(tmp_path, header, exponent, roughness, specular, metallic):
+    # As obj_export_mtl.cc writes them: the ambient color is the metalness, or 1 for dielectrics.
+    illum, ambient = 1 if specular == 0 else 3 if metallic else 2, metallic or 1
+    statements = f"Kd .8 .6 .4\nKe 0 0 0\nNi 1.45\nd 1\nillum {illum}\nNs {exponent * (1 - roughness) ** 2}\n"
+    statements += "".join(f"{key} {gray} {gray} {gray}\n" for key, gray in (("Ka", ambient), ("Ks", specular)))
+    material = exported(tmp_path, header, statements)
+    assert float(material.roughness) == pytest.approx(roughness, abs=1e-6)
+    assert float(material.metallic) == pytest.approx(metallic)
+    reflectance = ((material.ior - 1) / (material.ior + 1)) ** 2 * material.specular_color * material.specular
+    np.testing.assert_allclose(reflectance, [0.08 * specular] * 3, rtol=1e-5)
+    assert float(material.specular) == (specular > 0)
+    np.testing.assert_allclose(material.base_color, [0.8, 0.6, 0.4], rtol=1e-6)
+
+
+def test_textures_that_blender_exports_replace_the_factors_and_its_bumps_are_normal_maps(tmp_path):
+    write_png(tmp_path / "c.png", IMAGE)
+    maps = "map_Kd c.png\nmap_Pr c.png\nmap_Ke c.png\nmap_Bump -bm 0.5 c.png\n"
+    statements = f"Kd .8 .8 .8\nKs .5 .5 .5\nKe 0 0 0\nNs 250\nPr .5\nPm .25\nillum 2\n{maps}"
+    material = exported(tmp_path, "# Blender 4.2.1 LTS", statements)
+    np.testing.assert_array_equal(material.base_color, [1] * 3)
+    np.testing.assert_array_equal(material.emissive, [1] * 3)
+    assert (float(material.roughness), float(material.metallic), float(material.normal_scale)) == (1, 0.25, 0.5)
+    assert material.normal_texture is not None
+
+
+@pytest.mark.parametrize("header", ["# Blender v2.79 (sub 0) OBJ File: ''", "# Blender3D v249 OBJ File: ", "# Maya"])
+def test_materials_of_other_exporters_and_of_blender_before_principled_ones_are_phongs(tmp_path, header):
+    material = exported(tmp_path, header, "Kd .5 .5 .5\nKs .5 .5 .5\nKa x\nNs 250\nillum 2\n")
+    assert 2 / float(material.roughness) ** 4 - 2 == pytest.approx(250, rel=1e-4)
+    np.testing.assert_allclose(material.specular_color, [12.5] * 3, rtol=1e-6)
+
+
+def test_maps_lie_as_the_file_has_them_and_options_move_and_clamp_them(tmp_path):
+    (tmp_path / "a folder").mkdir()
+    write_png(tmp_path / "a folder" / "four colors.png", IMAGE)
+    statements = "Kd .5 1 1\nmap_Kd a folder\\four colors.png\nmap_Pr a folder/four colors.png\n"
+    part = one(tmp_path, statements + "map_Pm -s 1 1 1 -o .5 -clamp on a folder/four colors.png\n")
+    place = np.asarray(part.mesh.texture)
+    np.testing.assert_array_equal(place, [[0, 0], [1, 0], [1, 1], [0, 1]])
+    lower_left = part.material.at(jnp.array([[0.25, 0.25]]))
+    np.testing.assert_allclose(lower_left.base_color, [[0, 0, 1]], atol=1e-6)
+    np.testing.assert_allclose(lower_left.roughness, [0], atol=1e-6)  # The channel of red.
+    np.testing.assert_allclose(lower_left.metallic, [1], atol=1e-6)  # Moved by half the image: white.
+    upper_right = part.material.at(jnp.array([[0.75, 0.75]]))
+    np.testing.assert_allclose(upper_right.base_color, [[0, 1, 0]], atol=1e-6)
+    np.testing.assert_allclose(upper_right.metallic, [0], atol=1e-6)  # Beyond the edge: green.
+
+
+def test_libraries_and_images_are_read_once_and_only_those_of_used_materials(tmp_path, monkeypatch):
+    write_png(tmp_path / "a.png", IMAGE)
+    decoded, decode = [], images.decode_image
+    monkeypatch.setattr(
+        images, "decode_image", lambda *args, **how: decoded.append(how["name"]) or decode(*args, **how)
+    )
+    materials = "".join(f"newmtl m{number}\nmap_Kd a.png\nmap_Ke -s 2 a.png\nmap_Pr a.png\n" for number in range(9))
+    materials += "newmtl unused\nKd x\nhair\nmap_Kd absent.png\nmap_Ke ../outside.png\n"
+    path = write_materials(tmp_path, materials, f"usemtl m1\n{FACE}usemtl m7\n{FACE}")
+    path.write_text("mtllib scene.mtl\nmtllib ./scene.mtl\n" + path.read_text())
+    first, second = (part.material for part in load_scene(path).parts)  # without a warning
+    assert decoded == [str(tmp_path / "a.png")] * 2  # as colors, and as roughness
+    assert first.base_color_texture.image is second.base_color_texture.image is second.emissive_texture.image
+    assert first.roughness_texture.image is second.roughness_texture.image
+    np.testing.assert_array_equal(first.emissive_texture.transform, [[2, 0, 0], [0, 1, 0]])
+    np.testing.assert_allclose(first.base_color_texture.image, IMAGE, atol=1e-6)
+
+
+def test_damaged_images_are_decoded_once_and_named_once(tmp_path, monkeypatch):
+    (tmp_path / "text.png").write_text("no picture")
+    decoded, decode = [], images.decode_image
+    monkeypatch.setattr(
+        images, "decode_image", lambda *args, **how: decoded.append(how["name"]) or decode(*args, **how)
+    )
+    materials = "newmtl a\nmap_Kd text.png\nnewmtl b\nmap_Kd text.png\n"
+    path = write_materials(tmp_path, materials, f"usemtl a\n{FACE}usemtl b\n{FACE}")
+    with pytest.warns(UserWarning, match=r"ignored are map_Kd \(.*text\.png must be an EXR[^(]*\)$"):
+        assert len(load_scene(path).parts) == 2
+    assert len(decoded) == 1
+
+
+@pytest.mark.parametrize(
+    ("statement", "alpha"),
+    [("d -halo 0.5", 0.5), ("d -halo 1.0", None), ("d 1 # -halo", None), ("Tr .25", 0.75), ("d .5\nTr .25", 0.5)],
+)
+def test_d_and_tr_are_opacities(tmp_path, statement, alpha):
+    material = one(tmp_path, f"{statement}\n").material
+    got = None if material.alpha_mode == "opaque" else float(material.alpha)
+    assert (got, material.alpha_mode) == (alpha, "opaque" if alpha is None else "blend")
+
+
+def test_map_d_is_the_alpha_of_an_image_or_else_its_gray(tmp_path):
+    write_png(tmp_path / "alpha.png", np.array([[[0.1, 0.1, 0.1, 0.2]]]))
+    write_png(tmp_path / "gray.png", np.array([[[0.2, 0.1, 0.1]]]))
+    for name in ("alpha", "gray"):
+        material = one(tmp_path, f"d .5\nmap_d {name}.png\n").material
+        assert (float(material.alpha), material.alpha_mode) == (0.5, "blend")
+        np.testing.assert_allclose(material.alpha_texture.image, [[[0.2]]], rtol=1e-6)
+    with pytest.warns(UserWarning, match="ignored are d below 0 or above 1"):
+        assert float(one(tmp_path, "d -1\n").material.alpha) == 0
+
+
+def test_maps_that_move_without_end_are_refused_by_name(tmp_path):
+    write_png(tmp_path / "a.png", IMAGE)
+    for options in ("-s 1e300 1 1", "-o 0 -1e300"):
+        message = "scene.mtl, map_Kd of material 'a': the texture's transform must be finite"
+        with pytest.raises(ValueError, match=message):
+            one(tmp_path, f"map_Kd {options} a.png\n")
+    with pytest.raises(ValueError, match=r"scene\.mtl, material 'a': normal_scale"):
+        one(tmp_path, "norm -bm 1e300 a.png\n")
+
+
+def test_comments_end_names_only_where_their_sign_stands_alone(tmp_path):
+    write_png(tmp_path / "c#1.png", IMAGE)
+    materials = "newmtl M_#1 # first\nKd 1 0 0 # red\nmap_Kd c#1.png # four colors\nnewmtl M_#2 #\nKd 0 1 0#green\n"
+    path = write_materials(tmp_path, materials, f"usemtl M_#1 # first\n{FACE}usemtl M_#2\n{FACE}usemtl M_#1\n{FACE}")
+    path.write_text(path.read_text().replace("scene.mtl", "scene.mtl # materials"))
+    first, second = load_scene(path).parts  # Without a warning of anything missing.
+    assert (first.name, second.name) == ("M_#1", "M_#2")
+    assert (len(first.mesh.face), len(second.mesh.face)) == (4, 2)
+    np.testing.assert_array_equal(first.material.base_color, [1, 0, 0])
+    np.testing.assert_array_equal(second.material.base_color, [0, 1, 0])
+    assert first.material.base_color_texture is not None
+
+
+def test_what_is_missing_or_not_honored_is_said_once_by_name(tmp_path):
+    statements = "Kd 2 1 1\nbump a.png\nmap_Kd absent.png\nmap_Ke text.png\naniso 1\n"
+    (tmp_path / "text.png").write_text("no picture")
+    path = write_materials(tmp_path, f"newmtl a\n{statements}", "usemtl a\n" + FACE + "usemtl b\n" + FACE)
+    path.write_text("mtllib gone.mtl\n" + path.read_text())
+    with pytest.warns(UserWarning, match="not supported and ignored") as caught:
+        scene = load_scene(path)
+    (message,) = [str(each.message) for each in caught]
+    assert message.startswith(f"{path}: not supported and ignored are ")
+    expected = ["Kd above 1", "aniso", "bump", r"absent.png, which does not exist", "text.png must be an EXR"]
+    for each in [*expected, "gone.mtl, which does not exist", "usemtl b (no such material)"]:
+        assert message.count(each) == 1, each
+    np.testing.assert_array_equal(scene["a"].material.base_color, [1, 1, 1])
+    assert scene["a"].material.textures == ()
+    np.testing.assert_array_equal(scene["b"].material.base_color, [0.5] * 3)
+    path.write_text(SQUARE + FACE)
+    assert [part.name for part in load_scene(path).parts] == [path.stem]
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        ("Kd 1 x 1", "material 'a': Kd must have finite numbers, got 'Kd 1 x 1'"),
+        ("Ns nan", "material 'a': Ns must have finite numbers, got 'Ns nan'"),
+        ("Kd", "material 'a': Kd must have finite numbers, got 'Kd'"),
+        ("Kd spectral a.rfl", "material 'a': Kd must have finite numbers, got 'Kd spectral a.rfl'"),
+        ("Pr -1", "material 'a': roughness of TexturedMaterial must be between 0 and 1"),
+    ],
+)
+def test_damaged_numbers_are_refused_by_name(tmp_path, statement, message):
+    with pytest.raises(ValueError, match=f"scene.mtl, {message}"):
+        one(tmp_path, statement)
+
+
+@pytest.mark.parametrize("name", ["fuze", "rabbit", "chair_model", "negative_indices"])
+def test_real_files_have_the_regions_of_their_meshes_and_say_what_is_missing(data, name):
+    path = data / f"meshes_awkward/{name}.obj"
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scene = load_scene(path)
+    assert len(caught) <= 1
+    own = split(load_mesh(path))
+    assert [len(part.mesh.face) for part in scene.parts] == [len(each.face) for each in own]
+    for part in scene.parts:
+        assert np.isfinite(part.surface().base_color).all()

@@ -1,7 +1,7 @@
 // Prints where three.js has the vertices of a glTF file in poses of its animations, as JSON: some positions and the mean.
 // Lights, if there are any, come last.
 // npm install three@0.187 && node three_poses.mjs FILE [NAME@SECONDS ...]; without a name, the first animation.
-// three_poses.json is the output for each file of test_gltf_animation.py, by the name of the file.
+// three_poses.json is the output for each file of test_gltf_nodes.py, by the name of the file.
 import fs from 'node:fs';
 import path from 'node:path';
 import * as THREE from 'three';
