@@ -272,7 +272,7 @@ def away(value: dict, true: dict) -> dict[str, float]:
     return {"error": max(errors.values()), **errors}
 
 
-def observed(mesh: Mesh, images: list[np.ndarray], views: list[Camera]) -> inverse.Pixels:
+def observed(mesh: Mesh, images: list[np.ndarray], views: list[Camera]) -> inverse.Observations:
     """What pictures show."""
     return inverse.observe(mesh, [inverse.Picture(image, view) for image, view in zip(images, views, strict=True)])
 

@@ -139,7 +139,7 @@ def fine_part(count: int, quick: bool) -> list[dict[str, Any]]:
     mesh, size = scene(count, quick), SIZE if quick else FINE
     visibility.precompute(builtin.plane(cells=1), size=size, progress=False)
     before, parts = harness.peak_memory(), 2 if quick else PARTS
-    with tempfile.TemporaryDirectory() as folder, visibility.Part(1, parts) as part:
+    with tempfile.TemporaryDirectory() as folder, visibility.Shard(1, parts) as part:
         path, began = pathlib.Path(folder) / "store", time.perf_counter()
         with contextlib.suppress(visibility.UnfinishedError):
             visibility.precompute(mesh, size=size, path=path, executor=part, progress=False)

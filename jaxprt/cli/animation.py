@@ -13,7 +13,7 @@ from jaxprt import files, image
 from jaxprt.brdf import CookTorrance, Lambert, navigation
 from jaxprt.brdf.navigation import Family
 from jaxprt.cli.inputs import about
-from jaxprt.cli.report import Candidate, View
+from jaxprt.cli.report import SystemScene, View
 from jaxprt.relit import regions, warn
 from jaxprt.scene import Camera, TexturedMaterial
 from jaxprt.scene.environment import rotate
@@ -114,9 +114,9 @@ def materials(ready: Ready, view: View, *, turn: float = 0.0) -> list[Material |
     return result
 
 
-def made(ready: Ready, view: View) -> Candidate:
+def made(ready: Ready, view: View) -> SystemScene:
     """The scene in the form that the report needs."""
-    return Candidate(ready.direct, ready.system, view.scene.mesh, materials(ready, view), {"scene": ready.cost})
+    return SystemScene(ready.direct, ready.system, view.scene.mesh, materials(ready, view), {"scene": ready.cost})
 
 
 def animate(ready: Ready, view: View, output: Path, *, frames: int, progress: bool = True) -> list[Path]:

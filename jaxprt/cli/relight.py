@@ -16,7 +16,7 @@ import numpy as np
 import jaxprt
 from jaxprt.cli import animation, inputs, options, report
 from jaxprt.cli.options import option
-from jaxprt.cli.report import Candidate, View
+from jaxprt.cli.report import SystemScene, View
 from jaxprt.files import outputs
 from jaxprt.image.tonemap import TONES
 from jaxprt.relit.planning import Plan
@@ -136,7 +136,7 @@ def _run(chosen: SimpleNamespace) -> dict[str, Any]:
     return summary
 
 
-def _draw(summary: dict[str, Any], view: View, candidates: dict[str, Candidate], output: Path) -> None:
+def _draw(summary: dict[str, Any], view: View, candidates: dict[str, SystemScene], output: Path) -> None:
     """Writes all pictures and adds their errors to the report."""
     drawn = report.draw(view, candidates)
     truth = report.exact(view, drawn)
@@ -173,12 +173,12 @@ def _systems(chosen: SimpleNamespace) -> tuple[str, ...]:
     return systems
 
 
-def _part(text: str | None) -> blocks.Part | None:
+def _part(text: str | None) -> blocks.Shard | None:
     """Parses the part K/N of all blocks to compute; None for all blocks."""
     number, _, count = ("1/1" if text is None else text).partition("/")
     if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
         raise click.UsageError(f"--part must be K/N, two whole numbers with K from 1 to N, got {text}")
-    return None if text is None else blocks.Part(int(number), int(count))
+    return None if text is None else blocks.Shard(int(number), int(count))
 
 
 def load_plan(folder: Path) -> Plan:
@@ -213,7 +213,7 @@ def make_folder(path: Path, *, name: str = "--output") -> None:
 
 
 def _share(
-    view: View, chosen: SimpleNamespace, systems: tuple[str, ...], plan: Plan | None, part: blocks.Part
+    view: View, chosen: SimpleNamespace, systems: tuple[str, ...], plan: Plan | None, part: blocks.Shard
 ) -> list[str]:
     """Computes one part of the blocks. Returns what remains to be done."""
     left = []
@@ -226,8 +226,8 @@ def _share(
 
 
 def _precompute(
-    system: str, view: View, chosen: SimpleNamespace, plan: Plan | None, part: blocks.Part | None = None
-) -> dict[str, Candidate]:
+    system: str, view: View, chosen: SimpleNamespace, plan: Plan | None, part: blocks.Shard | None = None
+) -> dict[str, SystemScene]:
     """The scene, precomputed by one system, or by several sizes of it."""
     output, more = chosen.output, {"executor": part}
     if system == "planned" and plan is not None:

@@ -61,7 +61,7 @@ class View(NamedTuple):
     tone: str = "srgb"
 
 
-class Candidate(NamedTuple):
+class SystemScene(NamedTuple):
     """A scene that one system has precomputed.
 
     Attributes:
@@ -121,7 +121,7 @@ class Truth(NamedTuple):
 
 def plan(
     view: View, output: Path, *, error: float | None, bounces: int | str | None, executor: Executor | None = None
-) -> Candidate:
+) -> SystemScene:
     """Precomputes a scene by a plan. The plan is stored too, so that the same command continues with the same plan.
 
     Raises:
@@ -142,7 +142,7 @@ def make(
     *,
     bounces: int | str | None,
     executor: Executor | None = None,
-) -> Candidate:
+) -> SystemScene:
     """Precomputes a scene by one recipe, or by one recipe for each part. Finished work is kept in a folder.
 
     Raises:
@@ -157,7 +157,7 @@ def make(
     return candidate
 
 
-def _precompute(view: View, output: Path, **options: Any) -> Candidate:
+def _precompute(view: View, output: Path, **options: Any) -> SystemScene:
     start, existed = timeit.default_timer(), output.exists()
     try:
         ready = relit.precompute(view.scene, refine=False, path=output, **options)
@@ -165,10 +165,10 @@ def _precompute(view: View, output: Path, **options: Any) -> Candidate:
         raise ValueError(f"{error}; on the command line, name another --output" if existed else str(error)) from error
     direct = ready.without_bounces()
     cost = {"seconds": timeit.default_timer() - start, "bytes": ready.nbytes}
-    return Candidate(direct, direct if ready.bounces is None else ready, direct.mesh, None, cost)
+    return SystemScene(direct, direct if ready.bounces is None else ready, direct.mesh, None, cost)
 
 
-def draw(view: View, reports: dict[str, Candidate]) -> dict[str, list[Array]]:
+def draw(view: View, reports: dict[str, SystemScene]) -> dict[str, list[Array]]:
     """Pictures under direct light by each system, for all lights."""
     return {
         system: candidate.pictures(list(view.lights.values()), view.camera) for system, candidate in reports.items()
@@ -241,7 +241,7 @@ def _counts(scene: Scene) -> list[int]:
 
 
 def compare(
-    view: View, candidates: dict[str, Candidate], drawn: dict[str, list[Array]], truth: Truth, output: Path
+    view: View, candidates: dict[str, SystemScene], drawn: dict[str, list[Array]], truth: Truth, output: Path
 ) -> dict[str, dict[str, Any]]:
     """Writes the pictures and returns each system's errors under each light.
 
@@ -276,7 +276,7 @@ def compare(
     return result
 
 
-def _errors(view: View, name: str, candidate: Candidate, picture: Array, truth: Truth) -> dict[str, Any]:
+def _errors(view: View, name: str, candidate: SystemScene, picture: Array, truth: Truth) -> dict[str, Any]:
     """Relative L2 errors of a picture and of vertices, and the number of vertices with negative radiance."""
     number, color = list(view.lights).index(name), candidate.color(view.lights[name], jnp.asarray(view.camera.eye))
     parts = jnp.split(color, np.cumsum(_counts(view.scene))[:-1])
@@ -292,7 +292,7 @@ def _errors(view: View, name: str, candidate: Candidate, picture: Array, truth: 
     }
 
 
-def reflect(view: View, system: str, candidate: Candidate, stops: dict[str, float], output: Path) -> dict[str, float]:
+def reflect(view: View, system: str, candidate: SystemScene, stops: dict[str, float], output: Path) -> dict[str, float]:
     """Writes pictures that include interreflection. Returns its fraction of each picture's light."""
     lights, camera, pixels = list(view.lights.values()), view.camera, _points(view)
     direct, whole = (candidate.pictures(lights, camera, reflected=bounces) for bounces in (False, True))
@@ -316,7 +316,7 @@ def _write(output: Path, name: str, picture: Array, stops: Array, *, gain: float
     files.write_png(output / f"{name}.png", np.asarray(shown))
 
 
-def times(view: View, candidate: Candidate) -> dict[str, float]:
+def times(view: View, candidate: SystemScene) -> dict[str, float]:
     """Median seconds per picture: with a new light from a cached view, and with a new view from the start."""
     light, camera = next(iter(view.lights.values())), view.camera
     edge = math.isqrt(_KEPT)

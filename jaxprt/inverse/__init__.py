@@ -9,7 +9,7 @@ rasterization. Residuals are relative to the norm of the pictures: 0.03 means 3 
 """
 
 from jaxprt.inverse.fit import jointly, light, material
-from jaxprt.inverse.pictures import Picture, Pixels, observe, residual, smoothness
+from jaxprt.inverse.pictures import Observations, Picture, observe, residual, smoothness
 from jaxprt.inverse.solve import Fit
 
-__all__ = ["Fit", "Picture", "Pixels", "jointly", "light", "material", "observe", "residual", "smoothness"]
+__all__ = ["Fit", "Observations", "Picture", "jointly", "light", "material", "observe", "residual", "smoothness"]

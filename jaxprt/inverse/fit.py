@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxprt.inverse import pictures, solve
-from jaxprt.inverse.pictures import Pixels
+from jaxprt.inverse.pictures import Observations
 from jaxprt.inverse.solve import Fit
 
 
 def light(
     radiance: Callable,
     start: PyTree,
-    pixels: Pixels,
+    pixels: Observations,
     *,
     lower: PyTree = None,
     upper: PyTree = None,
@@ -69,7 +69,7 @@ def light(
 def material(
     radiance: Callable,
     start: PyTree,
-    pixels: Pixels,
+    pixels: Observations,
     *,
     lower: PyTree = None,
     upper: PyTree = None,
@@ -117,7 +117,7 @@ def material(
 def jointly(
     radiance: Callable,
     start: tuple[PyTree, PyTree],
-    pixels: Pixels,
+    pixels: Observations,
     *,
     lower: PyTree = None,
     upper: PyTree = None,
@@ -184,11 +184,11 @@ def jointly(
     )
 
 
-def _check(radiance: Callable, pixels: Pixels) -> None:
+def _check(radiance: Callable, pixels: Observations) -> None:
     """Refuses a radiance that is not a function, and pixels that are not from `observe`."""
     if not callable(radiance):
         raise TypeError(f"the radiance must be a function, got {type(radiance).__name__}")
-    if not isinstance(pixels, Pixels):
+    if not isinstance(pixels, Observations):
         raise TypeError(f"pixels must be from jaxprt.inverse.observe, got {type(pixels).__name__}")
     solve.outside(pixels)
 

@@ -79,7 +79,7 @@ class Picture(eqx.Module):
             require.real("the saturation of a picture", self.saturation)
 
 
-class Pixels(eqx.Module):
+class Observations(eqx.Module):
     """The pixels that count, and which vertices each of them shows.
 
     Attributes:
@@ -97,7 +97,7 @@ class Pixels(eqx.Module):
     vertices: int = eqx.field(static=True)
 
 
-def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
+def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Observations:
     """Finds the pixels that show the mesh and count in a fit.
 
     A pixel counts if it lies inside its mask, is not saturated and is not at the silhouette of the mesh. Pixels on
@@ -131,7 +131,7 @@ def observe(mesh: Mesh, pictures: Sequence[Picture]) -> Pixels:
     if not np.any(value):
         raise ValueError("pictures must not be black wherever they count")
     eye = jnp.stack([picture.camera.local(mesh.origin).eye for picture in pictures])
-    return Pixels(eye, jax.device_put(vertex), jax.device_put(weight), jax.device_put(value), len(mesh.position))
+    return Observations(eye, jax.device_put(vertex), jax.device_put(weight), jax.device_put(value), len(mesh.position))
 
 
 def _picture_rows(number: int, mesh: Mesh, picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -193,7 +193,7 @@ def _inside(seen: np.ndarray) -> np.ndarray:
     return np.all([wide[i : i + height, j : j + width] for i in range(3) for j in range(3)], 0)
 
 
-def residual(radiance: Callable, parameters: PyTree, pixels: Pixels) -> Float[Array, " m"]:
+def residual(radiance: Callable, parameters: PyTree, pixels: Observations) -> Float[Array, " m"]:
     """Difference between the scene's pixels and the observed ones, relative to the norm of the observed ones.
 
     Args:
@@ -223,7 +223,7 @@ class Residual(eqx.Module):
 
     radiance: Callable
     like: PyTree
-    pixels: Pixels
+    pixels: Observations
 
     def __call__(self, row: Float[Array, " n"]) -> Float[Array, " m"]:
         """The residual of these numbers."""

@@ -81,8 +81,9 @@ def precompute(
             without a plan.
         path: Folder in which finished work is stored. A call that was interrupted resumes from there.
         executor: Executor that computes the blocks of work. If None, all cores of this machine. A
-            `jaxprt.visibility.Part` computes only its share of the blocks, for machines that have nothing in common but
-            `path`. A `ProcessPoolExecutor` must have the context "spawn", since forked processes hang where JAX runs.
+            `jaxprt.visibility.Shard` computes only its share of the blocks, for machines that have nothing in common
+            but `path`. A `ProcessPoolExecutor` must have the context "spawn", since forked processes hang where JAX
+            runs.
         progress: Whether to show progress bars.
 
     Returns:

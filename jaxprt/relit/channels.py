@@ -22,8 +22,8 @@ from jaxprt.brdf import BlinnPhong, ClearCoat, Lambert, MetallicRoughness, Sheen
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import jit, known
 from jaxprt.scene import Mesh, Part, material_table
-from jaxprt.scene.material import Surface, TexturedMaterial
-from jaxprt.scene.material_table import SMOOTHEST, Look
+from jaxprt.scene.material import MaterialValues, TexturedMaterial
+from jaxprt.scene.material_table import SMOOTHEST, MaterialLook
 from jaxprt.scene.points import Points
 from jaxprt.sphere import directions
 from jaxprt.systems import standard
@@ -95,7 +95,7 @@ class Appearance(eqx.Module):
     emitted: Float[Array | np.ndarray, "v 3"] | None = None
 
 
-def blend(look: Look, term: tuple[int, ...], scale: Float[Array | np.ndarray, " k"], *, varies: bool) -> Blend:
+def blend(look: MaterialLook, term: tuple[int, ...], scale: Float[Array | np.ndarray, " k"], *, varies: bool) -> Blend:
     """The weights of a system's channels at points with given materials.
 
     Args:
@@ -118,7 +118,9 @@ def _any_table(_: StandardTable) -> bool:
     return True
 
 
-def of_part(part: Part, *, look: Look | None = None, takes: Callable[[StandardTable], bool] = _any_table) -> Shading:
+def of_part(
+    part: Part, *, look: MaterialLook | None = None, takes: Callable[[StandardTable], bool] = _any_table
+) -> Shading:
     """Converts a part of a scene to a `Shading`, the input of the systems.
 
     A texture of anisotropy is replaced by its mean, with a warning.
@@ -165,7 +167,9 @@ def of_part(part: Part, *, look: Look | None = None, takes: Callable[[StandardTa
     return Shading(mesh, table.family, exact, (table.knot,), own, emitted, table.term, table.scale, table)
 
 
-def _alone(mesh: Mesh, exact: PerVertex, look: Look, emitted: Any, term: tuple[int, ...], anisotropy: float) -> Shading:
+def _alone(
+    mesh: Mesh, exact: PerVertex, look: MaterialLook, emitted: Any, term: tuple[int, ...], anisotropy: float
+) -> Shading:
     """A part with a table of its own, over the roughness that it has."""
     knot = _knots(np.asarray(look.log_roughness))
     scale = np.mean(np.abs(look.coefficient[:, np.asarray(term)]), (0, 2))
@@ -176,7 +180,7 @@ def _alone(mesh: Mesh, exact: PerVertex, look: Look, emitted: Any, term: tuple[i
     return Shading(mesh, brdf, exact, knot, blend(look, term, scale, varies=bool(knot)), emitted, term, scale)
 
 
-def _shiny(part: Part, brdf: BlinnPhong, look: Look | None, takes: Callable[[StandardTable], bool]) -> Shading:
+def _shiny(part: Part, brdf: BlinnPhong, look: MaterialLook | None, takes: Callable[[StandardTable], bool]) -> Shading:
     """A part with a Blinn-Phong material. One sharper than the standard tables keeps a table of its own."""
     table = standard.BLINN_PHONG
     if np.ndim(brdf.exponent) or float(brdf.exponent) > table.most_exponent or not takes(table):
@@ -186,17 +190,17 @@ def _shiny(part: Part, brdf: BlinnPhong, look: Look | None, takes: Callable[[Sta
     return Shading(part.mesh, table.family, brdf, (table.knot,), own, None, table.term, table.scale, table)
 
 
-def looks(parts: Sequence[Part]) -> list[Look]:
+def looks(parts: Sequence[Part]) -> list[MaterialLook]:
     """The materials at the vertices of each part, by one program for all."""
     every, result, first = material_table.of_parts(parts).at_vertices(), [], 0
     for part in parts:
         own = slice(first, first + len(part.mesh.position))
-        result.append(Look(*jax.tree.map(lambda each, own=own: each[own], tuple(every))))
+        result.append(MaterialLook(*jax.tree.map(lambda each, own=own: each[own], tuple(every))))
         first = own.stop
     return result
 
 
-def _look(part: Part) -> Look:
+def _look(part: Part) -> MaterialLook:
     """The material at the vertices of a part. Its roughness is known if JAX does not trace it."""
     (look,) = looks([part])
     if known(look) or not known(plain := dataclasses.replace(part, material=rough(part.material))):
@@ -233,7 +237,7 @@ def _normal_map(material: TexturedMaterial) -> dict[str, Any]:
     return {"normal_texture": material.normal_texture, "normal_scale": material.normal_scale}
 
 
-def _metallic(look: Look, anisotropy: Any) -> MetallicRoughness:
+def _metallic(look: MaterialLook, anisotropy: Any) -> MetallicRoughness:
     """The BRDF of each vertex or point."""
     values = {name: value for name, value in look.values._asdict().items() if name != "emissive"}
     zero = 0 * values["roughness"]
@@ -251,7 +255,7 @@ def _table_of_layer(part: Part) -> LayeredTable:
     return standard.COATED
 
 
-def _layered(name: str, look: Look, table: LayeredTable) -> ClearCoat | Sheen:
+def _layered(name: str, look: MaterialLook, table: LayeredTable) -> ClearCoat | Sheen:
     """The BRDF of each vertex or point of a part with a clear coat or a sheen."""
     assert look.log_layer is not None
     layer, roughness = look.coefficient[:, table.term[-1]], jnp.exp(look.log_layer)
@@ -263,14 +267,14 @@ def _layered(name: str, look: Look, table: LayeredTable) -> ClearCoat | Sheen:
         raise ValueError(f"part {name!r}, factor times texture: {error}") from error
 
 
-def _model(name: str, look: Look, shading: Shading) -> Any:
+def _model(name: str, look: MaterialLook, shading: Shading) -> Any:
     """The BRDF of each vertex or point of a part."""
     if isinstance(shading.table, standard.LayeredTable):
         return _layered(name, look, shading.table)
     return _metallic(look, _anisotropy(shading))
 
 
-def _without_layer(name: str, look: Look, table: LayeredTable) -> Look:
+def _without_layer(name: str, look: MaterialLook, table: LayeredTable) -> MaterialLook:
     """The materials without their clear coats or sheens, with a warning."""
     warnings.warn(
         f"the {table.over} of part {name!r} is left out: anisotropic materials, and systems without the standard "
@@ -302,7 +306,7 @@ def without_layers(material: TexturedMaterial) -> TexturedMaterial:
 
 
 def appearance(
-    part: Part, shading: Shading, material: TexturedMaterial | BlinnPhong, *, look: Look | None = None
+    part: Part, shading: Shading, material: TexturedMaterial | BlinnPhong, *, look: MaterialLook | None = None
 ) -> Appearance:
     """Evaluates a new material at the vertices of a precomputed part.
 
@@ -433,7 +437,7 @@ def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Ar
     return PerVertex(_model(part.name, look, shading)), look.emitted, points.tilted(look.normal)
 
 
-def _fits(name: str, shading: Shading, look: Look) -> Any:
+def _fits(name: str, shading: Shading, look: MaterialLook) -> Any:
     """Whether the terms and the roughness of each vertex were precomputed. If values are known, refuses others."""
     if shading.table is not None:
         return np.ones(len(look.log_roughness), bool)
@@ -535,7 +539,7 @@ def _knots(log_roughness: Float[np.ndarray, " v"]) -> tuple[np.ndarray, ...]:
     return (np.linspace(low, high, 1 + int(np.ceil((high - low) / np.log(_STEP)))),)
 
 
-def _turned(mesh: Mesh, surface: Surface) -> Mesh:
+def _turned(mesh: Mesh, surface: MaterialValues) -> Mesh:
     """The mesh with tangents along the anisotropy."""
     straight = bool(np.all(np.asarray(surface.direction) == [1, 0])) or not np.any(np.asarray(surface.anisotropy))
     return (
@@ -544,7 +548,7 @@ def _turned(mesh: Mesh, surface: Surface) -> Mesh:
 
 
 @jit
-def _along(normal: Array, tangent: Array, surface: Surface) -> Array:
+def _along(normal: Array, tangent: Array, surface: MaterialValues) -> Array:
     frame = directions.frame(normal, tangent)
     along = jnp.einsum("vi,vij->vj", surface.direction, frame[:, :2], precision="highest")
     return directions.frame(normal, along)[:, 0]

@@ -21,7 +21,7 @@ from jaxprt.relit import channels
 from jaxprt.relit.channels import Appearance, Shading
 from jaxprt.scene import Environment, Mesh, PointLight
 from jaxprt.scene import origin as origins
-from jaxprt.scene.material_table import ROW, Look, MaterialTable, at_vertices
+from jaxprt.scene.material_table import ROW, MaterialLook, MaterialTable, at_vertices
 from jaxprt.scene.mesh import frames, join
 from jaxprt.scene.points import Points
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart
@@ -58,7 +58,7 @@ class Surface(eqx.Module):
     term: tuple[int, ...] = eqx.field(static=True)
     varies: bool = eqx.field(static=True)
 
-    def blend(self, look: Look) -> Blend | None:
+    def blend(self, look: MaterialLook) -> Blend | None:
         """Weights of the channels at points with given materials."""
         if self.scale is None:
             return None
@@ -312,7 +312,7 @@ class Stage(eqx.Module):
             row = np.minimum(np.arange(first, first + ROW), len(scene) - 1)
             yield group[row], at_vertices(scene[row]), at_vertices(group[row])
 
-    def alone(self, number: int, look: Look, channel: int) -> Look:
+    def alone(self, number: int, look: MaterialLook, channel: int) -> MaterialLook:
         """The materials with weight 1 of one channel of a group's BRDF, and 0 of the others."""
         surface = self.surfaces[number]
         if surface.scale is None:
@@ -453,7 +453,7 @@ def ordered(colors: tuple[Float[Array, "_ _"], ...], order: Int[Array, " v"]) ->
     return jnp.concatenate([jnp.broadcast_to(each, (len(each), most)) for each in colors])[order]
 
 
-def look_at(table: MaterialTable, rough: MaterialTable | None, points: Points) -> Look:
+def look_at(table: MaterialTable, rough: MaterialTable | None, points: Points) -> MaterialLook:
     """The materials at points.
 
     Args:
@@ -472,7 +472,7 @@ def look_at(table: MaterialTable, rough: MaterialTable | None, points: Points) -
 
 @jit
 def material(
-    surface: Surface, points: Points, look: Look, given: Given | None
+    surface: Surface, points: Points, look: MaterialLook, given: Given | None
 ) -> tuple[Blend | None, Float[Array, "p 3"]]:
     """Weights of the channels at points of a group, and the radiance that they emit.
 

@@ -25,7 +25,7 @@ from jaxprt.relit.shadows import TexelShares, TracedLight
 from jaxprt.relit.surface import Interpolated, Viewed, combine_interpolated, from_texels, lit, view, view_interpolated
 from jaxprt.relit.tracing import Reflections
 from jaxprt.scene import Camera, Environment
-from jaxprt.scene.material_table import Look
+from jaxprt.scene.material_table import MaterialLook
 from jaxprt.scene.points import Points
 from jaxprt.systems.lamps import LampTransport
 
@@ -373,7 +373,7 @@ def _seen(
     points: Points,
     own: Points,
     camera: Camera,
-    look: Look | None = None,
+    look: MaterialLook | None = None,
     lamps: LampTransport | None = None,
 ) -> Viewed:
     """What does not depend on the light, for a row of points with their materials, or others."""

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, PyTree, UInt8
 
 from jaxprt.compile import jit, kept
 from jaxprt.relit.groups import Given, Surface, material
-from jaxprt.scene.material_table import Look
+from jaxprt.scene.material_table import MaterialLook
 from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import directions
 from jaxprt.systems import bright_texels
@@ -77,7 +77,7 @@ class Interpolated(eqx.Module):
 def view(
     surface: Surface,
     points: Points,
-    look: Look,
+    look: MaterialLook,
     eye: Float[Array, "*p 3"],
     *,
     given: Given | None = None,
@@ -123,7 +123,7 @@ def lit(surface: Surface, arriving: tuple[PyTree, PyTree, PyTree], viewed: Viewe
 def view_interpolated(
     surface: Surface,
     points: Points,
-    look: Look,
+    look: MaterialLook,
     eye: Float[Array, "3"],
     *,
     given: Given | None,

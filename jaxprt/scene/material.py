@@ -80,7 +80,7 @@ class Texture(eqx.Module):
         return texture.lookup(self.image, moved, wrap=self.wrap)
 
 
-class Surface(eqx.Module):
+class MaterialValues(eqx.Module):
     """Material parameters at surface points, in the local frame (tangent, bitangent, normal) of each point.
 
     Attributes:
@@ -112,7 +112,7 @@ class TexturedMaterial(eqx.Module):
     """The metallic-roughness material of glTF 2.0: factors, and textures that multiply them.
 
     Factors are pytree leaves with the defaults of the specification: a white, rough metal. A gray color may be given as
-    one number. Missing textures are None. `Surface` explains the parameters.
+    one number. Missing textures are None. `MaterialValues` explains the parameters.
 
     Attributes:
         base_color: Linear color, from 0 to 1.
@@ -244,7 +244,7 @@ class TexturedMaterial(eqx.Module):
         *,
         color: Float[Array, "*b 3"] | None = None,
         handedness: Float[Array, "*b"] | None = None,
-    ) -> Surface:
+    ) -> MaterialValues:
         """Evaluates the material at vertices of a mesh or other points. Textures are read sharply.
 
         The result is differentiable in the factors, the images and, within texels, the coordinates. If a normal map or
@@ -273,7 +273,7 @@ class TexturedMaterial(eqx.Module):
         if handedness is not None:
             direction = direction * jnp.stack([jnp.ones_like(handedness), handedness], -1)
             normal = normal * jnp.stack([jnp.ones_like(handedness), handedness, jnp.ones_like(handedness)], -1)
-        return Surface(
+        return MaterialValues(
             base if color is None else base * color,
             value(self.metallic, self.metallic_texture)[..., 0],
             value(self.roughness, self.roughness_texture)[..., 0],

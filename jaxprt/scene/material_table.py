@@ -75,7 +75,7 @@ _LONG = 1.5  # ratio of length to width above which one lookup is not enough
 
 
 class Values(NamedTuple):
-    """Material parameters at points; `jaxprt.scene.material.Surface` explains them."""
+    """Material parameters at points; `jaxprt.scene.material.MaterialValues` explains them."""
 
     base_color: Float[Array | np.ndarray, "p 3"]
     metallic: Float[Array | np.ndarray, " p"]
@@ -96,7 +96,7 @@ class Layers(NamedTuple):
     sheen_roughness: Float[Array, " p"]
 
 
-class Look(NamedTuple):
+class MaterialLook(NamedTuple):
     """What systems need of the materials at points.
 
     Attributes:
@@ -175,7 +175,7 @@ class MaterialTable(eqx.Module):
         """Whether it has columns for layers: clear coats, sheens and transmission."""
         return self.image.shape[1] > len(TEXTURES)
 
-    def at(self, points: Points) -> Look:
+    def at(self, points: Points) -> MaterialLook:
         """The materials at points. Textures are averaged over the pixels of points that have slopes.
 
         Outside of `jax.jit` any number of points runs one program, and the result of other numbers than `ROW` is in
@@ -191,7 +191,7 @@ class MaterialTable(eqx.Module):
         xp = np if known(rows) else jnp
         return jax.tree.map(lambda *row: xp.concatenate(row)[:count], *rows)
 
-    def at_vertices(self) -> Look:
+    def at_vertices(self) -> MaterialLook:
         """The materials at all vertices; in NumPy unless JAX traces the table."""
         return self.at(at_vertices(np.arange(len(self.part), dtype=np.int32)))
 
@@ -204,7 +204,7 @@ def at_vertices(vertex: Int[np.ndarray, " p"]) -> Points:
 
 
 @kept
-def _evaluate(table: MaterialTable, points: Points) -> Look:
+def _evaluate(table: MaterialTable, points: Points) -> MaterialLook:
     values, layers = _values(table, points)
     normal = None
     if table.frame is not None:
@@ -219,14 +219,16 @@ def _evaluate(table: MaterialTable, points: Points) -> Look:
     material = MetallicRoughness(**{name: value for name, value in values._asdict().items() if name != "emissive"})
     coefficient = jnp.where(shiny[:, None, None], colors, material.coefficient())
     least = jnp.where(shiny, 0, SMOOTHEST)
-    look = Look(coefficient, jnp.log(jnp.maximum(values.roughness, least)), values.emissive, values, normal=normal)
+    look = MaterialLook(
+        coefficient, jnp.log(jnp.maximum(values.roughness, least)), values.emissive, values, normal=normal
+    )
     if layers is None:
         return look
     coated = table.factor[:, _SHINY + 1][table.part[points.corner[0]]] > 0
     return _under_layers(look, layers, coated)
 
 
-def _under_layers(look: Look, layers: Layers, coated: Bool[Array, " p"]) -> Look:
+def _under_layers(look: MaterialLook, layers: Layers, coated: Bool[Array, " p"]) -> MaterialLook:
     """The materials with their layers: what is under a coat or a sheen, and less diffuse light where light passes."""
     coat, passing = layers.clearcoat, 1 - layers.transmission
     base = look.coefficient * jnp.stack([passing, jnp.ones_like(coat), jnp.ones_like(coat), passing], 1)[..., None]

@@ -18,7 +18,7 @@ from jaxprt.scene import mesh as meshes
 from jaxprt.scene import origin as origins
 from jaxprt.scene.camera import Camera, orbit
 from jaxprt.scene.environment import Environment, Sun
-from jaxprt.scene.material import Surface, TexturedMaterial
+from jaxprt.scene.material import MaterialValues, TexturedMaterial
 from jaxprt.scene.mesh import Mesh
 
 _EDGE = 1e-3  # smallest difference of the cosines of a cone's angles, as in KHR_lights_punctual
@@ -91,7 +91,7 @@ class Part(eqx.Module):
                 field = ("mesh.texture", "second")[texture.set]
                 raise ValueError(f"part {self.name!r} must have {field} for the textures of its material, got None")
 
-    def surface(self) -> Surface:
+    def surface(self) -> MaterialValues:
         """Material parameters at the vertices.
 
         Raises:

@@ -51,7 +51,7 @@ class Division(NamedTuple):
     parent: Int[np.ndarray, "n 2"]
 
 
-class Points(NamedTuple):
+class TrianglePoints(NamedTuple):
     """Points on triangles.
 
     Attributes:
@@ -154,7 +154,7 @@ def middle_normal(normal: Float[np.ndarray, "v 3"], parent: Int[np.ndarray, "n 2
     return np.where(np.linalg.norm(mean, axis=1, keepdims=True) > _CANCELED, mean, normal[parent[:, 0]])
 
 
-def scatter(count: Int[np.ndarray, " f"]) -> Points:
+def scatter(count: Int[np.ndarray, " f"]) -> TrianglePoints:
     """A given number of evenly distributed points in each triangle; the same in every run.
 
     Points follow the additive recurrence R2, folded from the square into the triangle.
@@ -163,10 +163,10 @@ def scatter(count: Int[np.ndarray, " f"]) -> Points:
     rank = np.arange(len(triangle)) - np.repeat(np.cumsum(count) - count, count)
     place = ((rank + 0.5)[:, None] * _R2) % 1
     place = np.where(place.sum(1, keepdims=True) > 1, 1 - place, place)
-    return Points(triangle, np.column_stack([place, 1 - place.sum(1)]))
+    return TrianglePoints(triangle, np.column_stack([place, 1 - place.sum(1)]))
 
 
-def relocate(points: Points, face: Int[np.ndarray, "f 3"], division: Division) -> Points:
+def relocate(points: TrianglePoints, face: Int[np.ndarray, "f 3"], division: Division) -> TrianglePoints:
     """Finds the triangles of points after a subdivision step. The positions do not change.
 
     Args:
@@ -186,7 +186,7 @@ def relocate(points: Points, face: Int[np.ndarray, "f 3"], division: Division) -
         now = np.linalg.solve(np.swapaxes(corner, 1, 2), points.weight[..., None])[..., 0]
         better = now.min(1) > weight.min(1)
         triangle, weight = np.where(better, child, triangle), np.where(better[:, None], now, weight)
-    return Points(triangle, weight)
+    return TrianglePoints(triangle, weight)
 
 
 def subdivide(mesh: Mesh, divisions: Sequence[Division]) -> Mesh:

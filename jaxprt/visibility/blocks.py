@@ -62,7 +62,7 @@ class Job(abc.ABC):
         """Computes one block of every result array. Also returns the number of rays that it traced."""
 
 
-class Part(ThreadPoolExecutor):
+class Shard(ThreadPoolExecutor):
     """An executor that computes only the k-th of n equal parts of a job's blocks, on this machine.
 
     With it several machines can share a job; they need only a shared folder. Pass it as `executor`, with the same
@@ -115,7 +115,7 @@ def compute(
     Args:
         job: The computation.
         path: Folder of the store. Finished blocks are kept there; blocks found there are not computed again.
-        executor: Executor that computes the blocks; threads on this machine's cores if None. A `Part` computes only
+        executor: Executor that computes the blocks; threads on this machine's cores if None. A `Shard` computes only
             its own blocks. A `ProcessPoolExecutor` must have the context "spawn" or "forkserver".
         progress: Whether to show a progress bar.
         label: Text of the progress bar.
@@ -125,7 +125,7 @@ def compute(
         whose first axis is that of the blocks are memory-mapped: pages are read when they are first used.
 
     Raises:
-        ValueError: The store at `path` was made from other inputs, `executor` is a `Part` and there is no path, or it
+        ValueError: The store at `path` was made from other inputs, `executor` is a `Shard` and there is no path, or it
             forks this process.
         BlockingIOError: Another process is writing to the store.
         OSError: The disk is full; finished blocks are kept in the store.
@@ -134,7 +134,7 @@ def compute(
     """
     _check_context(executor)
     blocks = -(-job.vertices // job.step)
-    part = executor if isinstance(executor, Part) else None
+    part = executor if isinstance(executor, Shard) else None
     if part is not None and path is None:
         raise ValueError(f"part {part.number}/{part.count} must have a path, the folder that all parts share, got None")
     store = None if path is None else BlockStore(path, job.header, job.layout, blocks, job.near)
@@ -225,7 +225,7 @@ def _run(job, todo, keep, store, executor, bar) -> None:
     key = uuid.uuid4().hex
     threads = ThreadPoolExecutor(cores()) if executor is None else None
     pool: Executor = executor or threads  # pyright: ignore[reportAssignmentType]
-    here = threads is not None or isinstance(executor, Part)
+    here = threads is not None or isinstance(executor, Shard)
     _jobs[key] = job, store
     # Every core already computes a block, and the additional threads of LAPACK would wait by spinning: beside two
     # busy processes clusters took three times as long. An executor that the caller passes has its own setting.

@@ -22,7 +22,7 @@ from jaxprt.scene import light_samples, subdivision
 from jaxprt.scene.camera import Camera, orbit
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh, relative
-from jaxprt.scene.subdivision import Division, Edges, Points
+from jaxprt.scene.subdivision import Division, Edges, TrianglePoints
 from jaxprt.visibility import blocks
 from jaxprt.visibility.diffuse import DiffuseTracer
 from jaxprt.visibility.occluder import Occluder, check
@@ -67,7 +67,7 @@ def cameras(mesh: Mesh, scene_cameras: Sequence[Camera], parts: Sequence[Mesh]) 
     return chosen
 
 
-def places(mesh: Mesh, occluder: Occluder, views: Sequence[Camera]) -> tuple[Points, Float[np.ndarray, " p"]]:
+def places(mesh: Mesh, occluder: Occluder, views: Sequence[Camera]) -> tuple[TrianglePoints, Float[np.ndarray, " p"]]:
     """Points of a mesh that cameras see from the front, and the share of all pictures that each stands for.
 
     Args:
@@ -87,9 +87,9 @@ def places(mesh: Mesh, occluder: Occluder, views: Sequence[Camera]) -> tuple[Poi
             weights.append(weight[seen])
             shares.append(np.full(np.count_nonzero(seen), 1 / np.count_nonzero(seen)))
     if not triangles:
-        return Points(np.zeros(0, np.int64), np.zeros((0, 3))), np.zeros(0)
+        return TrianglePoints(np.zeros(0, np.int64), np.zeros((0, 3))), np.zeros(0)
     share = np.concatenate(shares) / len(shares)
-    return Points(np.concatenate(triangles), np.concatenate(weights).astype(np.float64)), share
+    return TrianglePoints(np.concatenate(triangles), np.concatenate(weights).astype(np.float64)), share
 
 
 def _rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -228,7 +228,7 @@ def interpolation_error(mesh: Mesh, *, views: Sequence[Camera]) -> float:
         return float(surface.squares().sum(0).max()) ** 0.5
 
 
-def _visible_places(mesh: Mesh, views: Sequence[Camera]) -> tuple[subdivision.Points, Float[np.ndarray, " p"]]:
+def _visible_places(mesh: Mesh, views: Sequence[Camera]) -> tuple[subdivision.TrianglePoints, Float[np.ndarray, " p"]]:
     return places(mesh, Occluder(mesh), views)
 
 
@@ -245,7 +245,11 @@ class _Surface:
     """
 
     def __init__(
-        self, mesh: Mesh, tracer: DiffuseTracer, points: int, seen: tuple[subdivision.Points, Float[np.ndarray, " p"]]
+        self,
+        mesh: Mesh,
+        tracer: DiffuseTracer,
+        points: int,
+        seen: tuple[subdivision.TrianglePoints, Float[np.ndarray, " p"]],
     ):
         self.position, self.normal = np.asarray(mesh.position), np.asarray(mesh.normal, np.float64)
         self.face = np.asarray(mesh.face, np.int64)
@@ -265,7 +269,7 @@ class _Surface:
         self._shown = seen[1][coarse].sum() > 0
         self.share = _UNSEEN * area + (1 - _UNSEEN) * of_pictures if self._shown else area
         pairs = zip(even, seen[0], strict=True)
-        self._points = subdivision.Points(*(np.concatenate([one, other[coarse]]) for one, other in pairs))
+        self._points = subdivision.TrianglePoints(*(np.concatenate([one, other[coarse]]) for one, other in pairs))
         self._picture = np.concatenate([np.zeros(len(even.triangle)), seen[1][coarse]])
         self._at_points, self._inside = self._traced_points()
         self.error = np.zeros((len(self.face), self.light.shape[1]))

@@ -24,7 +24,7 @@ from jaxprt import bounces, harmonic, lobe, separable, visibility
 from jaxprt.files.arrays import BlockStore, Layout
 from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.systems.separable import precompute
-from jaxprt.visibility import Part, UnfinishedError
+from jaxprt.visibility import Shard, UnfinishedError
 
 SIZE = 4  # Vertices to a block.
 
@@ -200,20 +200,20 @@ def test_parts_in_any_order_make_the_whole_and_the_last_of_them_returns_it(tmp_p
     path, log = tmp_path / "a.prt", []
     for number, left in ((2, 5), (3, 2)):
         with (
-            Part(number, 3) as part,
+            Shard(number, 3) as part,
             pytest.raises(UnfinishedError, match=rf"part {number}/3 .*; {left} of its 8 blocks"),
         ):
             visibility.blocks.compute(Counting(log=log), path=path, executor=part, progress=False)
-    with Part(1, 3) as part:
+    with Shard(1, 3) as part:
         check(visibility.blocks.compute(Counting(log=log), path=path, executor=part, progress=False))
     assert sorted(log) == list(range(8))
-    assert [list(Part(number, 3).of(8)) for number in (1, 2, 3)] == [[0, 1], [2, 3, 4], [5, 6, 7]]
+    assert [list(Shard(number, 3).of(8)) for number in (1, 2, 3)] == [[0, 1], [2, 3, 4], [5, 6, 7]]
 
 
 def test_two_parts_of_one_number_write_at_once_and_the_same_part_twice_is_refused(tmp_path):
     job, path = Counting(), tmp_path / "a.prt"
     store = BlockStore(path, job.header, job.layout, 8)
-    with store.writing((2, 3)), Part(1, 3) as one, Part(2, 3) as two, Part(1, 2) as half:
+    with store.writing((2, 3)), Shard(1, 3) as one, Shard(2, 3) as two, Shard(1, 2) as half:
         with pytest.raises(UnfinishedError):
             visibility.blocks.compute(job, path=path, executor=one, progress=False)
         for executor in (two, half, None):
@@ -225,11 +225,11 @@ def test_two_parts_of_one_number_write_at_once_and_the_same_part_twice_is_refuse
 @pytest.mark.parametrize(("number", "count"), [(0, 4), (5, 4), (1, 0), (-1, -1)])
 def test_parts_that_are_not_there_are_refused(number, count):
     with pytest.raises(ValueError, match=f"the part must be from 1/.*, got {number}/{count}"):
-        Part(number, count)
+        Shard(number, count)
 
 
 def test_a_part_without_a_folder_is_refused():
-    with Part(1, 2) as part, pytest.raises(ValueError, match="part 1/2 must have a path"):
+    with Shard(1, 2) as part, pytest.raises(ValueError, match="part 1/2 must have a path"):
         visibility.blocks.compute(Squares(), executor=part, progress=False)
 
 

@@ -120,7 +120,7 @@ import sys
 import jaxprt as prt
 from jaxprt import visibility
 mesh = prt.scene.builtin.sphere(rings=20, sectors=30)
-with visibility.Part(int(sys.argv[2]), 3) as part:
+with visibility.Shard(int(sys.argv[2]), 3) as part:
     try:
         visibility.precompute(mesh, size=8, path=sys.argv[1], executor=part, progress=False)
     except visibility.UnfinishedError:

@@ -75,7 +75,7 @@ class Element(NamedTuple):
         return sum((item.length or item.dtype).itemsize for item in self.properties)
 
 
-class Header(NamedTuple):
+class PlyHeader(NamedTuple):
     """The header of a PLY file.
 
     Attributes:
@@ -94,7 +94,7 @@ class Header(NamedTuple):
 Columns = dict[str, np.ndarray | Lists]
 
 
-def read_header(content: bytes) -> Header:
+def read_header(content: bytes) -> PlyHeader:
     """Reads the header.
 
     Raises:
@@ -125,7 +125,7 @@ def read_header(content: bytes) -> Header:
             raise ValueError(f"its header has a line that is not known, {text.name(line)[:80]!r}") from None
     if order is None:
         raise ValueError(f"its header must state a format, one of {', '.join(_ORDERS)}")
-    header = Header(order, elements, comments, end.end())
+    header = PlyHeader(order, elements, comments, end.end())
     _check_counts(header, len(content) - header.end)
     return header
 
@@ -137,7 +137,7 @@ def _property(words: list[str], order: str) -> Property:
     return Property(words[-1].lower(), types[-1], types[0] if len(types) == 2 else None)
 
 
-def _check_counts(header: Header, size: int) -> None:
+def _check_counts(header: PlyHeader, size: int) -> None:
     """Refuses headers that count more rows than the file can hold, before memory is allocated for them."""
     names: set[str] = set()
     for element in header.elements:
@@ -154,13 +154,13 @@ def _check_counts(header: Header, size: int) -> None:
         )
 
 
-def table_memory(header: Header, size: int) -> int:
+def table_memory(header: PlyHeader, size: int) -> int:
     """Most bytes that `read_elements` needs, as measured, for a file of `size` bytes."""
     rows = sum(element.rows for element in header.elements if any(item.length for item in element.properties))
     return 3 * size + 20 * rows + 4 * min(_BYTES, size) if header.order else 16 * size
 
 
-def read_elements(content: bytes, header: Header, names: set[str], lists: set[str]) -> dict[str, Columns]:
+def read_elements(content: bytes, header: PlyHeader, names: set[str], lists: set[str]) -> dict[str, Columns]:
     """Reads the tables of the named elements: the columns by the names of their properties.
 
     Numbers of text files are float64, and others have the type of the header.
