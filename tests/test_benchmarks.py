@@ -82,7 +82,7 @@ def small(coarse, bound):
         for room, name, value in (
             (prt.separable.factorization, "_BLOCK", 64),
             (lobe.pyramid, "_BLOCK", 64),
-            (raster.depths, "CHUNK", 1024),
+            (raster, "CHUNK", 1024),
         ):
             patch.setattr(room, name, value)
         yield  # Benchmarks share compiled programs, which have these sizes in them.

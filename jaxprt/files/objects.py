@@ -444,10 +444,10 @@ def save(path: str | os.PathLike, object: Any) -> None:
     path = Path(path)
     if path.exists():
         raise FileExistsError(f"{path} exists; remove it or name another path")
-    arrays: list[tuple[Any, np.ndarray]] = []
+    leaves: list[tuple[Any, np.ndarray]] = []
     modules: set[str] = set()
-    tree = _describe(object, type(object).__name__, arrays, modules)
-    table = [{"dtype": array.dtype.name, "shape": array.shape, "checksum": checksum(array)} for _, array in arrays]
+    tree = _describe(object, type(object).__name__, leaves, modules)
+    table = [{"dtype": array.dtype.name, "shape": array.shape, "checksum": checksum(array)} for _, array in leaves]
     algorithm = {name: algorithm_of(name) for name in modules}
     content = json.dumps({"tree": tree, "array": table, "algorithm": algorithm})
     header = {"format": FORMAT, "version": VERSION}
@@ -456,10 +456,10 @@ def save(path: str | os.PathLike, object: Any) -> None:
     shutil.rmtree(aside, ignore_errors=True)
     try:
         aside.mkdir(parents=True)
-        for number, (_, array) in enumerate(arrays):
+        for number, (_, array) in enumerate(leaves):
             stored = storable(array)
             with (aside / f"{number}.npy").open("xb") as file:
-                write_header(file, stored.shape, stored.dtype.str)
+                arrays.write_header(file, stored.shape, stored.dtype.str)
                 file.write(stored.reshape(-1).view(np.uint8).data)
         (aside / HEADER).write_text(json.dumps(header))
         if path.exists():

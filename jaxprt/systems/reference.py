@@ -85,7 +85,7 @@ def radiance(
     rays = visibility.Occluder(mesh if occluder is None else relative(occluder, mesh.origin))
     if points is None:
         start = visibility.start_points(mesh, rays)
-        vertex = visibility.rays.chosen(mesh, vertex)
+        vertex = visibility.rays.vertex_indices(mesh, vertex)
         position, frame = mesh.position, directions.frame(mesh.normal, mesh.tangent)
     elif vertex is not None:
         raise ValueError("give either vertices or points, got both")

@@ -22,6 +22,8 @@ from jaxtyping import Bool, Float32, Integer
 from numba.core import types
 from numba.extending import intrinsic
 
+from jaxprt.compile import numba_loop
+
 WIDTH = 16
 # From embree4/include/embree4/rtcore_*.h.
 _ROBUST = 1 << 2

@@ -233,7 +233,7 @@ def test_more_patches_than_a_chunk_are_all_drawn(monkeypatch, chunk, triangles):
     assert np.any(whole.triangle == triangles - 1)
     expected, _, margin = _traced(position, face, camera)
     np.testing.assert_array_equal(whole.triangle[margin > 1e-5], expected[margin > 1e-5])
-    monkeypatch.setattr(raster.depths, "CHUNK", chunk)
+    monkeypatch.setattr(raster, "CHUNK", chunk)
     pieces = jax.jit(lambda mesh, camera: raster.rasterize.__wrapped__(mesh, camera))(mesh, camera)
     np.testing.assert_array_equal(pieces.triangle, whole.triangle)
     np.testing.assert_allclose(pieces.depth, whole.depth, rtol=1e-5)
@@ -352,7 +352,7 @@ def test_gpus_draw_what_cpus_draw(elsewhere, monkeypatch, samples):
     face = np.concatenate([face, face[:6], [[0, 0, 1]]])  # Of equal triangles the first is seen; some have no area.
     mesh, camera = _mesh(position, face), _camera()
     wide = raster.rasterize(mesh, camera, samples=samples)
-    monkeypatch.setattr(raster.depths, "WIDE", 64)  # Several steps, some within a triangle.
+    monkeypatch.setattr(raster, "WIDE", 64)  # Several steps, some within a triangle.
     steps = raster.rasterize.__wrapped__(mesh, camera, samples=samples)
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *arguments, cpu, **forms: cpu(*arguments))
     narrow = raster.rasterize.__wrapped__(mesh, camera, samples=samples)

@@ -315,7 +315,7 @@ def test_an_error_in_a_worker_is_passed_on_and_finished_blocks_stay(tmp_path):
 # Forks before any thread of JAX runs, so that many deaths cost one start of Python.
 MOMENTS = """
 import os, signal, sys, time
-from jaxprt.files import mapped
+from jaxprt.files import arrays
 from jaxprt.files.arrays import BlockStore
 from tests.visibility.test_blocks import Squares
 from jaxprt.visibility import blocks
@@ -329,7 +329,7 @@ for moment in map(float, sys.argv[3:]):
             signal.setitimer(signal.ITIMER_REAL, moment)
         else:
             calls = [0]
-            owner, name = {"write": (BlockStore, "_put"), "create": (mapped, "write_header")}[kind]
+            owner, name = {"write": (BlockStore, "_put"), "create": (arrays, "write_header")}[kind]
             original = getattr(owner, name)
 
             def counted(*arguments, **options):

@@ -104,7 +104,7 @@ def precompute(
     Reference: Kautz, Sloan, Snyder 2002, section 5.
     """
     check(degree, size)
-    check_memory(len(visibility.rays.chosen(mesh, vertex)), degree, in_files=path is not None)
+    check_memory(len(visibility.rays.vertex_indices(mesh, vertex)), degree, in_files=path is not None)
     job = _Job.make(mesh, occluder, vertex, size, apart=apart, degree=degree, diffuse=False)
     result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress)
     position = visibility.rays.place(mesh, vertex)

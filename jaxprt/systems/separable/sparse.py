@@ -22,7 +22,7 @@ from jaxprt.files.arrays import Layout, sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.systems.separable.factorization import SeparableBrdf, marked
-from jaxprt.visibility.arguments import PRECOMPUTE
+from jaxprt.visibility.rays import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "separable": 1}
