@@ -12,7 +12,8 @@ from jaxprt.compile import jit
 def disk_direction(coordinates: Float[Array, "*b 2"]) -> Float[Array, "*b 3"]:
     """Inverse of `jaxprt.sphere.hemisphere.disk_coordinates`.
 
-    Points outside the disk give the nearest direction at the horizon. At and beyond the rim the gradient is that of the horizontal direction, so it is finite everywhere.
+    Points outside the disk give the nearest direction at the horizon. At and beyond the rim the gradient is that of the
+    horizontal direction, so it is finite everywhere.
     """
     xy = 2 * coordinates - 1
     square = jnp.sum(xy**2, -1, keepdims=True)

@@ -10,11 +10,11 @@ from jaxprt.visibility import starts as starts
 from jaxprt.visibility import stored as stored
 from jaxprt.visibility.blocks import Shard, UnfinishedError
 from jaxprt.visibility.occluder import Occluder
-from jaxprt.visibility.starts import point_starts as point_starts
 from jaxprt.visibility.rays import LEVELS as LEVELS
 from jaxprt.visibility.rays import exhaustive as exhaustive
 from jaxprt.visibility.rays import fractional as fractional
 from jaxprt.visibility.refinement import refine
+from jaxprt.visibility.starts import point_starts as point_starts
 from jaxprt.visibility.starts import start_points as start_points
 from jaxprt.visibility.stored import StoredVisibility, precompute
 
