@@ -39,7 +39,7 @@ SYSTEMS = ("planned", *options.NAMES, "dynamic")
 )
 @option(
     "--plan",
-    "load_plan",
+    "saved",
     group="System",
     type=click.Path(exists=True, path_type=Path, file_okay=False),
     help="Use the plan in this folder, written by `jaxprt plan`.",
