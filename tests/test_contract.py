@@ -200,6 +200,11 @@ HOST = {
     "systems.bounces.between.quadratic": "takes indices; tested through bounces.factor",
     "brdf.navigation.blinn_phong": "checks values",
     "brdf.navigation.cook_torrance": "reads a file",
+    "systems.dynamic.table.tabulate": "checks values",
+    "systems.dynamic.table.without_tensor": "empty arrays",
+    "systems.dynamic.vertices.precompute": "traces rays",
+    "systems.dynamic.vertices.compress": "runs workers and writes files",
+    "systems.dynamic.vertices.clustering": "counts",
     "systems.dynamic.transport.precompute": "traces rays",
     "systems.dynamic.transport.compress": "runs workers and writes files",
     "systems.dynamic.relight.check_material": "checks values",
@@ -381,6 +386,12 @@ class Draw:
         )
         maps = self.normal(2, 4, 4), self.normal(2, 4, 4)
         return dynamic.DynamicBrdf(self.normal(2, 2, 2), self.normal(count, 1, 2), *maps, lobe, None, self.uniform())
+
+    def tensor(self):
+        """A BRDF with lobes and terms."""
+        lobe, maps = self.lobes(), (self.normal(2, 4, 4), self.normal(3, 4, 4))
+        factor = self.normal(len(lobe.weight), 2)
+        return dynamic.table.DynamicBrdf(lobe, self.normal(2, 2, 3), factor, *maps, self.uniform())
 
     def regions(self, size=8, vertices=3):
         """Transport of one region for ``changing`` and ``light``."""
@@ -719,6 +730,8 @@ EXAMPLES = {
     "systems.dynamic.brdf_set.Mixed": example(
         lambda draw: call(draw.changing().at(draw.uniform(2)), draw.upper(5), draw.upper(5)),
     ),
+    "systems.dynamic.table.DynamicBrdf": example(lambda draw: call(draw.tensor(), draw.upper(5), draw.upper(5))),
+    "systems.dynamic.vertices.light_factors": example(lambda draw: call(draw.tensor())),
     "systems.dynamic.transport.light_factors": example(lambda draw: call(draw.changing())),
     "systems.bounces.functions.weights": example(
         lambda draw: call(draw.normal(2, 1, 2), draw.uniform(2), draw.uniform(3), draw.uniform(1)),

@@ -169,6 +169,19 @@ def bright(name: str, model: str) -> tuple[prt.System, Any]:
 
 
 @functools.cache
+def tensor(model: str) -> dynamic.table.DynamicBrdf:
+    """A BRDF as few lobes and a tensor."""
+    return dynamic.table.tabulate(MODELS[model], lobes=lobe_table(model), ranks=(2, 6, 6), resolution=16)
+
+
+@functools.cache
+def dynamics(name: str, model: str) -> tuple[prt.System, Any]:
+    sizes = {"components": 16, "modes": 48, "keep": 384, "progress": False}
+    transport = dynamic.vertices.compress(seen(name), tensor(model), **sizes)
+    return dynamic.vertex_system.DynamicSystem(transport, tensor(model)), None
+
+
+@functools.cache
 def changing(name: str, model: str) -> tuple[dynamic.DynamicSystem, Any]:
     brdfs = [members()] * (1 + (name == "scene"))
     transport = dynamic.precompute(mesh(name), brdfs, size=SIZE, components=16, modes=32, keep=384, progress=False)
@@ -208,7 +221,8 @@ MADE = {
     "lobe": Promise(lobes, 0.02, 0.1),
     "lobe, matte": Promise(mattes, 0.02, None),
     "lobe, bright texels": Promise(bright, 0.02, 0.1, linear=False),
-    "dynamic": Promise(changing, 0.02, None, linear=False),
+    "dynamic": Promise(dynamics, 0.02, 0.1),
+    "dynamic, regions": Promise(changing, 0.02, None, linear=False),
     "bounces": Promise(reflected, None, None),
     "scene": Promise(of_parts, 0.02, 0.1),
     "scene with bounces": Promise(between_parts, None, None),

@@ -1,6 +1,15 @@
 """The dynamic system: direct light, with materials that can change at run time (Sun et al. 2007)."""
 
-from jaxprt.systems.dynamic import brdf_set, reflected, relight, system, transport
+from jaxprt.systems.dynamic import (
+    brdf_set,
+    reflected,
+    relight,
+    system,
+    table,
+    transport,
+    vertex_system,
+    vertices,
+)
 from jaxprt.systems.dynamic.brdf_set import DynamicBrdf, Mixed, factor, separate
 from jaxprt.systems.dynamic.relight import (
     DynamicLight,
@@ -37,6 +46,9 @@ __all__ = [
     "relight",
     "separate",
     "system",
+    "table",
     "transport",
+    "vertex_system",
+    "vertices",
     "view_side",
 ]
