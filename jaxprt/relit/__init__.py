@@ -3,12 +3,13 @@
 from jaxprt.relit import build, channels, exact, measuring, planning, probes, recipes, refinement, scene
 from jaxprt.relit.build import precompute
 from jaxprt.relit.planning import Plan, plan
-from jaxprt.relit.recipes import Clusters, Harmonics, Lobes, Terms
+from jaxprt.relit.recipes import Clusters, Dynamic, Harmonics, Lobes, Terms
 from jaxprt.relit.refinement import refine
 from jaxprt.relit.scene import RelitScene
 
 __all__ = [
     "Clusters",
+    "Dynamic",
     "Harmonics",
     "Lobes",
     "Plan",

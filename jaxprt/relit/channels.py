@@ -18,7 +18,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxprt.brdf import BlinnPhong, ClearCoat, Lambert, MetallicRoughness, Sheen, grid
+from jaxprt.brdf import BlinnPhong, ClearCoat, CookTorrance, Lambert, MetallicRoughness, Sheen, grid
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import jit, known
 from jaxprt.scene import Mesh, Part, material_table
@@ -31,11 +31,16 @@ from jaxprt.systems.protocol import Blend
 from jaxprt.systems.standard import LayeredTable, RoughnessFamily, StandardTable
 
 _STEP = 1.5  # largest ratio of neighboring tabulated roughnesses
+_TINY = 1e-12
 _EQUAL = 1e-3  # tolerance for equal roughness, anisotropy and normals
 _RARE = 0.02  # smallest scale of a channel, relative to the largest
 _NAMES = ("diffuse", "mirror", "rim", "bare diffuse")  # names of the terms of MetallicRoughness
 _BARE = (3,)  # the only term of a Lambertian material
+_MODELS: dict[StandardTable, type] = {standard.BLINN_PHONG: BlinnPhong, standard.COOK_TORRANCE: CookTorrance}
 _MATTE = "; a specular of 1e-6 is enough for a Lambertian part that is to become glossy"
+
+
+Changeable = TexturedMaterial | BlinnPhong | CookTorrance  # materials that may change after precomputation
 
 
 class Shading(eqx.Module):
@@ -140,8 +145,8 @@ def of_part(
             f"the material of part {part.name!r} must be one BRDF for all vertices or a TexturedMaterial, "
             "got a BRDF for each vertex"
         )
-    if isinstance(material, BlinnPhong):
-        return _shiny(part, material, look, takes)
+    if isinstance(material, BlinnPhong | CookTorrance):
+        return _of_model(part, material, look, takes)
     if not isinstance(material, TexturedMaterial):
         brdf = grid.as_argument(material)
         return Shading(part.mesh, brdf, brdf)
@@ -180,14 +185,24 @@ def _alone(
     return Shading(mesh, brdf, exact, knot, blend(look, term, scale, varies=bool(knot)), emitted, term, scale)
 
 
-def _shiny(part: Part, brdf: BlinnPhong, look: MaterialLook | None, takes: Callable[[StandardTable], bool]) -> Shading:
-    """A part with a Blinn-Phong material. One sharper than the standard tables keeps a table of its own."""
-    table = standard.BLINN_PHONG
-    if np.ndim(brdf.exponent) or float(brdf.exponent) > table.most_exponent or not takes(table):
+def _of_model(
+    part: Part, brdf: BlinnPhong | CookTorrance, look: MaterialLook | None, takes: Callable[[StandardTable], bool]
+) -> Shading:
+    """A part with an analytic model. One outside of the range of the standard tables keeps a table of its own."""
+    table = next(table for table, model in _MODELS.items() if isinstance(brdf, model))
+    if not takes(table) or not _in_range(brdf, table):
         return Shading(part.mesh, brdf, brdf)
     look = _look(part) if look is None else look
     own = blend(look, table.term, table.scale, varies=True)
     return Shading(part.mesh, table.family, brdf, (table.knot,), own, None, table.term, table.scale, table)
+
+
+def _in_range(brdf: BlinnPhong | CookTorrance, table: StandardTable) -> bool:
+    """Whether a standard table has the exponent or the roughness of a model, which is one number."""
+    low, high = np.exp(table.range)
+    if isinstance(brdf, BlinnPhong):
+        return not np.ndim(brdf.exponent) and 0 <= float(brdf.exponent) <= table.most_exponent * (1 + _EQUAL)
+    return not np.ndim(brdf.roughness) and bool(low * (1 - _EQUAL) <= float(brdf.roughness) <= high * (1 + _EQUAL))
 
 
 def looks(parts: Sequence[Part]) -> list[MaterialLook]:
@@ -305,9 +320,7 @@ def without_layers(material: TexturedMaterial) -> TexturedMaterial:
     return dataclasses.replace(material, **none, sheen_color=0.0, sheen_color_texture=None)
 
 
-def appearance(
-    part: Part, shading: Shading, material: TexturedMaterial | BlinnPhong, *, look: MaterialLook | None = None
-) -> Appearance:
+def appearance(part: Part, shading: Shading, material: Changeable, *, look: MaterialLook | None = None) -> Appearance:
     """Evaluates a new material at the vertices of a precomputed part.
 
     Textures may have any values. Parts with the standard tables take any material of their model. Other parts take what
@@ -323,24 +336,23 @@ def appearance(
     Raises:
         ValueError: The material uses texture coordinates that the mesh lacks, has a normal map that was not
             precomputed, or a term, a roughness or an anisotropy that the part's own tables lack.
-        TypeError: The part was precomputed with a Blinn-Phong material and the new one is metallic-roughness, or vice
-            versa.
+        TypeError: The new material is of another model than the precomputed one.
     """
     new = replaced(part, shading, material)
     look = _look(new) if look is None else look
     assert shading.scale is not None
     own = blend(look, shading.term, shading.scale, varies=bool(shading.knot))
     emitted = None if known(look.emitted) and not np.any(look.emitted) else look.emitted
-    if isinstance(material, BlinnPhong):
+    if isinstance(material, BlinnPhong | CookTorrance):
         return Appearance(own)
     fits = _fits(part.name, shading, look)
     weight = own.weight if known(fits) else jnp.where(fits[:, None, None], own.weight, jnp.nan)
     return Appearance(Blend(weight, own.parameter), emitted)
 
 
-def replaced(part: Part, shading: Shading, material: TexturedMaterial | BlinnPhong) -> Part:
+def replaced(part: Part, shading: Shading, material: Changeable) -> Part:
     """The part with a new material. Refuses materials that its system cannot have; `appearance` gives the errors."""
-    shiny = shading.table is standard.BLINN_PHONG
+    model = TexturedMaterial if shading.table is None else _MODELS.get(shading.table, TexturedMaterial)
     for table, name in ((standard.COATED, "clearcoat"), (standard.SHEENED, "sheen_color")):
         value = getattr(material, name, 0.0)
         if shading.table != table and not isinstance(value, Tracer) and np.any(np.asarray(value)):
@@ -348,22 +360,27 @@ def replaced(part: Part, shading: Shading, material: TexturedMaterial | BlinnPho
                 f"part {part.name!r} was precomputed without a {table.over}, got a material with {name}={value}: "
                 f"precompute it with a {table.over}, of a {name} of 1e-6 at least"
             )
-    if isinstance(material, BlinnPhong) != shiny:
-        kind = "BlinnPhong" if shiny else "TexturedMaterial"
-        raise TypeError(f"the material of part {part.name!r} must be a {kind}, got {type(material).__name__}")
-    if isinstance(material, BlinnPhong):
-        most = standard.BLINN_PHONG.most_exponent
-        if known(material.exponent) and not 0 <= float(material.exponent) <= most * (1 + _EQUAL):
-            raise ValueError(
-                f"the exponent of part {part.name!r} must be at most {most:.3g}, got {float(material.exponent):.3g}: "
-                "precompute the scene with it"
-            )
+    if not isinstance(material, model):
+        raise TypeError(f"the material of part {part.name!r} must be a {model.__name__}, got {type(material).__name__}")
+    if isinstance(material, BlinnPhong | CookTorrance):
+        assert shading.table is not None
+        if known(material) and not _in_range(material, shading.table):
+            _refuse_range(part.name, material, shading.table)
         return dataclasses.replace(part, material=material)
     new = dataclasses.replace(part, material=material)
     if known(material, shading):
         _check_frames(part, shading, new)
         _check_opacity(part, material)
     return new
+
+
+def _refuse_range(name: str, material: BlinnPhong | CookTorrance, table: StandardTable) -> None:
+    if isinstance(material, BlinnPhong):
+        allowed, value = f"exponent of part {name!r} must be at most {table.most_exponent:.3g}", material.exponent
+    else:
+        low, high = np.exp(table.range)
+        allowed, value = f"roughness of part {name!r} must be from {low:.3g} to {high:.3g}", material.roughness
+    raise ValueError(f"the {allowed}, got {float(value):.3g}: precompute the scene with it")
 
 
 def _check_opacity(part: Part, material: TexturedMaterial) -> None:
@@ -418,10 +435,14 @@ def materials_at(parts: Sequence[Part], shading: Shading, points: Points) -> tup
     assert shading.scale is not None
     look = material_table.of_parts(parts).at(points)
     own = blend(look, shading.term, shading.scale, varies=bool(shading.knot))
+    values = look.values
     if isinstance(parts[0].material, BlinnPhong):
-        values = look.values
         exponent = 2 / values.roughness**2 - 2
         return own, PerVertex(BlinnPhong(values.base_color, values.specular_color, exponent))
+    if isinstance(parts[0].material, CookTorrance):
+        mirror, rim = look.coefficient[:, 1], look.coefficient[:, 2]
+        f0 = mirror / jnp.maximum(mirror + rim, _TINY)
+        return own, PerVertex(CookTorrance(values.base_color, mirror + rim, values.roughness, f0))
     return own, PerVertex(_model(parts[0].name, look, shading))
 
 

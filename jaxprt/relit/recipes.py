@@ -16,7 +16,7 @@ from jaxprt import require, visibility
 from jaxprt.brdf import Lambert
 from jaxprt.relit.channels import Shading
 from jaxprt.scene import Mesh
-from jaxprt.systems import axes, bright_texels, harmonic, lobe, separable, standard
+from jaxprt.systems import axes, bright_texels, dynamic, harmonic, lobe, separable, standard
 from jaxprt.systems.lobe import LobeTransport, diffuse, pyramid
 from jaxprt.systems.protocol import System
 from jaxprt.systems.separable import SeparableBrdf
@@ -274,7 +274,65 @@ class Clusters(eqx.Module):
         return clusters, terms, {"components": components, "modes": modes, "keep": keep}
 
 
+class Dynamic(eqx.Module):
+    """Recipe of the dynamic system: lobes, and a tensor for what they leave. The brightest texels are summed exactly.
+
+    A Lambertian part has the system of `Lobes`.
+
+    Attributes:
+        lobes: Number of lobes of the BRDF; 0 for none.
+        ranks: Ranks of the tensor: of the BRDFs, the view and the light; None for no tensor. Transport grows with the
+            last one.
+        components: Number of principal components over the vertices of a cluster.
+        modes: Number of principal components over the light.
+        keep: Number of wavelet coefficients of each cluster.
+        texels: Number of brightest texels that are summed one by one.
+    """
+
+    joins: ClassVar = True
+
+    lobes: int = 12
+    ranks: tuple[int, int, int] | None = eqx.field(default=standard.RANKS, converter=lambda x: x and tuple(x))
+    components: int = 24
+    modes: int = 128
+    keep: int = 1024
+    texels: int = 16
+
+    def takes(self, table: StandardTable) -> bool:
+        """Whether tables with this number of lobes and these ranks are shipped."""
+        return table.has_tensor(self.lobes, self.ranks)
+
+    def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
+        """Precomputes the system of all vertices of the shading's mesh, padded to a number of vertices."""
+        if isinstance(shading.brdf, Lambert):
+            return Lobes(texels=self.texels).make(shading, target, vertices=vertices)
+        known = target.known
+        if known is None:
+            options = {**target.traced(), **target.options("visibility")}
+            known = Known(visibility.precompute(shading.mesh, size=target.size, **options))
+        brdf = dynamic_table(shading, self.lobes, self.ranks)
+        sizes = {"components": self.components, "modes": self.modes, "keep": self.keep}
+        name = "" if self.ranks is None else "_" + "_".join(map(str, (self.lobes, *self.ranks)))
+        options = {**sizes, **target.options(f"dynamic{name}")}
+        transport = _padded(dynamic.vertices.compress(known.visible, brdf, pyramid=known.pyramid, **options), vertices)
+        return _bright(
+            dynamic.vertex_system.DynamicSystem(transport, brdf), transport.pyramid, shading, self.texels, target.size
+        )
+
+    def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
+        """Number of bytes of the visibility, the weights of the components, the cores and the modes."""
+        if isinstance(shading.brdf, Lambert):
+            return Lobes(texels=self.texels).least_bytes(shading, vertices=vertices, size=size)
+        terms = 1 + (self.ranks[2] if self.ranks else 0)
+        sizes = self.components, self.modes, self.keep
+        clusters, most = dynamic.vertices.clustering(vertices, terms, 6 * size**2, *sizes)
+        shared = 2 * clusters * most["modes"] * (most["keep"] + most["components"] * terms)
+        seen = pyramid.scales(size).total + diffuse.count(size)
+        return vertices * (seen + 4 * most["components"]) + shared
+
+
 SYSTEMS: dict[str, Recipe] = {
+    "dynamic": Dynamic(),
     "harmonic": Harmonics(laplacian=0.4),
     "lobe": Lobes(),
     "separable": Terms(),
@@ -314,6 +372,13 @@ def lobe_table(shading: Shading, lobes: int) -> lobe.LobeBrdf:
         counts = shading.table.counts
         return shading.table.lobes(lobes if lobes in counts else min(counts, key=lambda each: abs(each - lobes)))
     return lobe.tabulate(shading.brdf, lobes=lobes, knot=shading.knot)
+
+
+def dynamic_table(shading: Shading, lobes: int, ranks: tuple[int, int, int] | None) -> dynamic.table.DynamicBrdf:
+    """The BRDF of a part as lobes and a tensor, over roughness if that varies."""
+    if shading.table is not None:
+        return shading.table.tensor(lobes, ranks)
+    return dynamic.table.tabulate(shading.brdf, lobes=lobes, ranks=ranks, knot=shading.knot)
 
 
 def harmonic_table(shading: Shading, *, degree: int) -> harmonic.HarmonicBrdf:

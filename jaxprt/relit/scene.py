@@ -1,6 +1,7 @@
 """Precomputed scenes: systems of groups of parts, and methods for radiance and pictures of the whole scene."""
 
 import dataclasses
+import typing
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,13 +13,13 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxprt import require
-from jaxprt.brdf import BlinnPhong, grid
+from jaxprt.brdf import grid
 from jaxprt.compile import Between, compile_time, known, promoted, put
 from jaxprt.image import automatic_exposure, pixels, raster
 from jaxprt.relit import channels, groups, interpolation, measuring, pictures, reflection, tracing
 from jaxprt.relit import lamps as scene_lamps
 from jaxprt.relit.casting import caster
-from jaxprt.relit.channels import Appearance, Shading, appearance
+from jaxprt.relit.channels import Appearance, Changeable, Shading, appearance
 from jaxprt.relit.groups import Arriving, Given, Place, SceneLight, Stage, Surface
 from jaxprt.relit.lamps import SceneLamps
 from jaxprt.relit.pictures import PictureView
@@ -64,10 +65,10 @@ class SceneView(eqx.Module):
 class RelitScene(System):
     """A precomputed scene. It is itself a system: its vertices are those of `scene.mesh`, in that order.
 
-    Materials are given as a dictionary from names of parts to new materials. A material is a `TexturedMaterial` or a
-    `BlinnPhong`, an `Appearance` for one that is already evaluated at the vertices, or a `Blend` to change only the
-    weights of the BRDF's channels. Parts that are not named keep the material that they were precomputed with. A part
-    that was precomputed with another BRDF, or with a `BlinnPhong` and no range of roughness, cannot change its
+    Materials are given as a dictionary from names of parts to new materials. A material is a `TexturedMaterial`, a
+    `BlinnPhong` or a `CookTorrance`, an `Appearance` for one that is already evaluated at the vertices, or a `Blend` to
+    change only the weights of the BRDF's channels. Parts that are not named keep the material that they were
+    precomputed with. A part that was precomputed with another BRDF, or without a range of roughness, cannot change its
     material. The dictionary may also map names of point lights to a `PointLight` with another intensity.
 
     Attributes:
@@ -650,9 +651,9 @@ class RelitScene(System):
             if shading.blend is None:
                 raise TypeError(
                     f"the material of part {name!r} is a BRDF, which cannot be replaced: precompute the scene with "
-                    "another one, with a TexturedMaterial, or a BlinnPhong"
+                    "another one, with a TexturedMaterial, a BlinnPhong or a CookTorrance"
                 )
-            kinds, source = (TexturedMaterial, BlinnPhong, Appearance, Blend), "jaxprt.scene or RelitScene.appearances"
+            kinds, source = (*typing.get_args(Changeable), Appearance, Blend), "jaxprt.scene or RelitScene.appearances"
             require.kind(f"the material of part {name!r}", given, *kinds, source=source)
             if _is_model(given):
                 first = int(self.place.first[number])
@@ -719,7 +720,7 @@ def _precomputed(shading: Shading) -> Appearance:
 
 def _is_model(material: Any) -> bool:
     """Whether a material is a model that is evaluated at vertices and points."""
-    return isinstance(material, TexturedMaterial | BlinnPhong)
+    return isinstance(material, Changeable)
 
 
 def _check_blend(name: str, shading: Shading, blend: Blend | None) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxprt.brdf import BlinnPhong, MetallicRoughness, sheen
+from jaxprt.brdf import BlinnPhong, CookTorrance, MetallicRoughness, sheen
 from jaxprt.compile import kept, known, put, shared_size
 from jaxprt.scene import texture
 from jaxprt.scene.material import Texture, TexturedMaterial
@@ -53,8 +53,12 @@ _FACTORS = (
     ("specular_color", 3),
     ("ior", 1),
 )
-_SHINY = sum(width for _, width in _FACTORS)  # column that is 1 for `BlinnPhong`
-# Columns after it, in scenes that have them, in the order of their textures.
+# Column after these: 1 for `BlinnPhong` and 2 for `CookTorrance`, whose F0 follows in three more.
+_MODEL = sum(width for _, width in _FACTORS)
+_METALLIC_ROUGHNESS, _BLINN_PHONG, _COOK_TORRANCE = range(3)
+_F0 = slice(_MODEL + 1, _MODEL + 4)
+_LAYER = _F0.stop  # first column of layers
+# Columns of layers, in scenes that have them, in the order of their textures.
 _LAYERS = (
     ("clearcoat", 1),
     ("clearcoat_roughness", 1),
@@ -101,9 +105,10 @@ class MaterialLook(NamedTuple):
 
     Attributes:
         coefficient: Weights of the four terms of `jaxprt.brdf.MetallicRoughness`. Those of `BlinnPhong` are its colors:
-            diffuse, specular, 0 and 0. In scenes with layers these are followed by the weights under a clear coat and
-            by that of the coat, and by those under a sheen and that of the sheen; without a layer the first four are
-            those of the material. See `jaxprt.systems.standard.layered`.
+            diffuse, specular, 0 and 0; those of `CookTorrance` are diffuse, specular x F0, specular x (1 - F0) and 0.
+            In scenes with layers these are followed by the weights under a clear coat and by that of the coat, and by
+            those under a sheen and that of the sheen; without a layer the first four are those of the material. See
+            `jaxprt.systems.standard.layered`.
         log_roughness: Logarithm of the roughness; that of metallic-roughness materials is at least `SMOOTHEST`.
         emitted: Radiance that the surface emits.
         values: The parameters themselves.
@@ -213,9 +218,11 @@ def _evaluate(table: MaterialTable, points: Points) -> MaterialLook:
         layers = layers and layers._replace(
             clearcoat_roughness=texture.widen_roughness(layers.clearcoat_roughness, variance)
         )
-    shiny = table.factor[:, _SHINY][table.part[points.corner[0]]] > 0
-    none = jnp.zeros_like(values.base_color)
-    colors = jnp.stack([values.base_color, values.specular_color, none, none], 1)
+    row = table.factor[table.part[points.corner[0]]]
+    grooves, f0 = row[:, _MODEL, None] == _COOK_TORRANCE, row[:, _F0]
+    none, specular = jnp.zeros_like(values.base_color), values.specular_color
+    mirror, rim = specular * jnp.where(grooves, f0, 1), specular * jnp.where(grooves, 1 - f0, 0)
+    shiny, colors = row[:, _MODEL] > 0, jnp.stack([values.base_color, mirror, rim, none], 1)
     material = MetallicRoughness(**{name: value for name, value in values._asdict().items() if name != "emissive"})
     coefficient = jnp.where(shiny[:, None, None], colors, material.coefficient())
     least = jnp.where(shiny, 0, SMOOTHEST)
@@ -224,7 +231,7 @@ def _evaluate(table: MaterialTable, points: Points) -> MaterialLook:
     )
     if layers is None:
         return look
-    coated = table.factor[:, _SHINY + 1][table.part[points.corner[0]]] > 0
+    coated = row[:, _LAYER] > 0
     return _under_layers(look, layers, coated)
 
 
@@ -253,7 +260,7 @@ def _values(table: MaterialTable, points: Points) -> tuple[Values, Layers | None
     layers = None
     if table.layered:
         scale = jax.lax.map(read, len(TEXTURES) + jnp.arange(len(_LAYERS)))
-        begin, columns = _SHINY + 1, []
+        begin, columns = _LAYER, []
         for texel, (_, width) in zip(scale, _LAYERS, strict=True):
             value = factor[:, begin : begin + width] * texel[:, :width]
             columns.append(value if width > 1 else value[:, 0])
@@ -548,16 +555,20 @@ def _set_at(array: Any, place: tuple[int, int], value: Any) -> Any:
 
 
 def _factors(material: TexturedMaterial | Callable, layered: bool) -> Any:
-    """The factors of a material as one row: `_FACTORS`, 1 for `BlinnPhong`, and those of layers."""
+    """The factors of a material as one row: `_FACTORS`, the kind of model, its F0, and those of layers."""
     textured = material if isinstance(material, TexturedMaterial) else TexturedMaterial()
     xp = np if known(material, textured) else jnp  # a material that is made while JAX traces has traced factors
+    layers = [getattr(textured, name) for name, _ in _LAYERS] if layered else []
+    factor: dict[str, Any] = dict(vars(textured))
+    model, f0 = _METALLIC_ROUGHNESS, xp.zeros(3)
+    if isinstance(material, BlinnPhong | CookTorrance):
+        factor |= {"base_color": material.diffuse, "specular_color": material.specular}
+        layers = [0] * sum(width for _, width in _LAYERS) if layered else []
     if isinstance(material, BlinnPhong):
-        colors = {"base_color": material.diffuse, "specular_color": material.specular}
-        factor: dict[str, Any] = vars(textured) | colors | {"roughness": xp.sqrt(2 / (material.exponent + 2))}
-        rest = [0] * sum(width for _, width in _LAYERS) if layered else []
-        return xp.hstack([*(xp.broadcast_to(factor[name], (width,)) for name, width in _FACTORS), 1, *rest])
-    rest = [getattr(textured, name) for name, _ in _LAYERS] if layered else []
-    return xp.hstack([*(getattr(textured, name) for name, _ in _FACTORS), 0, *rest])
+        model, factor["roughness"] = _BLINN_PHONG, xp.sqrt(2 / (material.exponent + 2))
+    elif isinstance(material, CookTorrance):
+        model, factor["roughness"], f0 = _COOK_TORRANCE, material.roughness, xp.broadcast_to(material.f0, (3,))
+    return xp.hstack([*(xp.broadcast_to(factor[name], (width,)) for name, width in _FACTORS), model, *f0, *layers])
 
 
 def _concatenate(rows: Sequence[Any], dtype: Any) -> Any:

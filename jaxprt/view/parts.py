@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxprt.brdf import GGX, BlinnPhong
+from jaxprt.brdf import GGX, BlinnPhong, CookTorrance
 from jaxprt.brdf.varying import Channels
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.scene import RelitScene
@@ -30,7 +30,8 @@ from jaxprt.view.reduced import (
 
 NO_SCALES = {"edges": [1], "spreads": [1.0], "starts": [0]}  # for scenes without glossy parts
 _STARTS = ("first", "weightStart", "pyramidStart", "visibleStart", "arrivedStart", "bitStart")
-_SHINY = [3, 4]  # terms by which the page's module represents `ShininessFamily`
+# Terms by which the page's module represents `ShininessFamily` and `SlopeFamily`.
+_TERMS = {standard.BLINN_PHONG: [3, 4], standard.COOK_TORRANCE: [3, 5, 6]}
 _SKY = 64  # most texels along the edge of a light's faces
 
 
@@ -171,7 +172,7 @@ def _family(shading: Shading) -> dict[str, list]:
     """Numbers of the BRDF terms of a part's channels in the page's module, and their factors; empty if unknown."""
     if shading.blend is None or shading.scale is None:
         return {"terms": [], "scale": []}
-    terms = _SHINY if shading.table is standard.BLINN_PHONG else list(shading.term)
+    terms = list(shading.term) if shading.table is None else _TERMS.get(shading.table, list(shading.term))
     return {"terms": terms, "scale": np.asarray(shading.scale, float).tolist()}
 
 
@@ -228,14 +229,17 @@ def _weights(shading: Shading, system: Exported) -> Float[np.ndarray, "v k 4"]:
     return result
 
 
+def _colors(material: Any, *names: str) -> dict[str, list[float]]:
+    """Parameters of a material in three colors."""
+    return {name: np.broadcast_to(np.asarray(getattr(material, name), float), 3).tolist() for name in names}
+
+
 def _material_json(material: Any, shading: Shading) -> dict[str, Any] | None:
     """Parameters of a material that is the same at all vertices; None for other materials."""
-    if isinstance(material, BlinnPhong) and shading.table is standard.BLINN_PHONG:
-        values = {
-            name: np.broadcast_to(np.asarray(getattr(material, name), float), 3) for name in ("diffuse", "specular")
-        }
-        fields = {name: value.tolist() for name, value in values.items()}
-        return {"material": fields | {"exponent": float(material.exponent)}}
+    if isinstance(material, BlinnPhong) and shading.table == standard.BLINN_PHONG:
+        return {"material": _colors(material, "diffuse", "specular") | {"exponent": float(material.exponent)}}
+    if isinstance(material, CookTorrance) and shading.table == standard.COOK_TORRANCE:
+        return {"material": _colors(material, "diffuse", "specular", "f0") | {"slope": float(material.roughness)}}
     if not isinstance(material, TexturedMaterial) or shading.scale is None:
         return None
     if any(isinstance(leaf, Texture) for leaf in jax.tree.leaves(material, is_leaf=lambda x: isinstance(x, Texture))):

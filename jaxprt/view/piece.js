@@ -119,7 +119,7 @@ float clear(int vertex, vec3 d) {
   float c = bit(vertex, face, near.y + 1, near.x), d4 = bit(vertex, face, near.y + 1, near.x + 1);
   return mix(mix(a, b, part.x), mix(c, d4, part.x), part.y);
 }
-// Terms of MetallicRoughness, and the lobe of BlinnPhong as the fifth, in 1/sr: see jaxprt/brdf/microfacet.py and models.py.
+// Terms of MetallicRoughness, the lobe of BlinnPhong as the fifth, and those of CookTorrance with an F0 of 1 and of 0, in 1/sr: see jaxprt/brdf/microfacet.py and models.py.
 vec4 family(vec3 wi, vec3 wo, vec3 normal, float rough) {
   vec3 h = normalize(wi + wo);
   float ci = dot(wi, normal), co = dot(wo, normal), z = dot(h, normal), schlick = pow(1. - min(dot(wo, h), 1.), 5.), alpha = max(exp(2. * rough), 1e-3), a = alpha * alpha;
@@ -127,8 +127,10 @@ vec4 family(vec3 wi, vec3 wo, vec3 normal, float rough) {
   float tilt = dot(flat_, flat_) / a + z * z, mask = .5 / (co * sqrt(a * (1. - ci * ci) + ci * ci) + ci * sqrt(a * (1. - co * co) + co * co));
   float lobe = mask / (3.14159265 * a * tilt * tilt), n = 2. * exp(-2. * rough) - 2.;
   float shiny = (n + 2.) * (n + 4.) / (25.1327412 * (exp2(-n / 2.) + n)) * exp(n / 2. * log(max(1. - dot(flat_, flat_), 1e-30)));
+  float m = max(exp(rough), 1e-3), cd = max(dot(wo, h), 1e-6), groove = min(1. / (ci * co), 2. * z / (cd * max(ci, co)));
+  float grooves = exp(-dot(flat_, flat_) / (z * z * m * m)) / (9.8696044 * m * m * z * z * z * z) * groove;
   vec4 result = vec4(0);
-  for (int k = 0; k < 4; k++) if (k < families) result[k] = scale[k] * (term[k] == 0 ? (1. - schlick) / 3.14159265 : term[k] == 1 ? lobe : term[k] == 2 ? lobe * schlick : term[k] == 4 ? shiny : 1. / 3.14159265);
+  for (int k = 0; k < 4; k++) if (k < families) result[k] = scale[k] * (term[k] == 0 ? (1. - schlick) / 3.14159265 : term[k] == 1 ? lobe : term[k] == 2 ? lobe * schlick : term[k] == 4 ? shiny : term[k] == 5 ? grooves : term[k] == 6 ? grooves * schlick : 1. / 3.14159265);
   return result;
 }
 vec3 texelWay(int i) {
@@ -757,6 +759,11 @@ class Piece {
       const specular = change?.f0 === undefined && !change?.specular ? own.specular : (change.specular ?? own.specular.map((x) => x / Math.max(most, 1e-6))).map((x) => x * strength);
       this.write(part, { 3: value.diffuse, 4: specular });
       return { weightStep: 0, log: Math.log(2 / (value.exponent + 2)) / 2 };
+    }
+    if (own.slope !== undefined) {
+      const most = Math.max(...own.f0), f0 = change?.f0 === undefined ? own.f0 : most > 0 ? own.f0.map((x) => x * change.f0 / most) : own.f0.map(() => change.f0);
+      this.write(part, { 3: value.diffuse, 5: value.specular.map((x, c) => x * f0[c]), 6: value.specular.map((x, c) => x * (1 - f0[c])) });
+      return { weightStep: 0, log: Math.log(Math.max(value.roughness ?? own.slope, 1e-3)) };
     }
     const white = ((1 - own.ior) / (1 + own.ior)) ** 2, f0White = Math.max(white, 1e-6);
     let tint = own.specular_color;

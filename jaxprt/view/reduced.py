@@ -13,7 +13,7 @@ from jaxprt.relit.groups import Place
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment
 from jaxprt.sphere import cubemap
-from jaxprt.systems import axes, bright_texels, harmonic, lobe
+from jaxprt.systems import axes, bright_texels, dynamic, harmonic, lobe
 from jaxprt.systems.lobe import diffuse, pyramid
 from jaxprt.systems.lobe.blurred_light import LobeLight
 from jaxprt.systems.protocol import System
@@ -186,10 +186,12 @@ def _exported(name: str, system: System) -> Exported:
         vector = diffuse.harmonics_of(matte.vector, size=matte.size, degree=_DEGREE)
         transport = harmonic.TransferVector(vector[:, None], put(matte.position))
         inner = harmonic.DiffuseSystem(transport, put(inner.albedo))
+    if isinstance(inner, dynamic.vertex_system.DynamicSystem):
+        inner = inner.lobes
     if not isinstance(inner, Exported):
         raise ValueError(
-            f"part {name!r} must be ideally diffuse or made by the system 'lobe' or 'harmonic' to be exported, got "
-            f"{type(inner).__name__}"
+            f"part {name!r} must be ideally diffuse or made by the system 'lobe', 'dynamic' or 'harmonic' to be "
+            f"exported, got {type(inner).__name__}"
         )
     if isinstance(inner, harmonic.HarmonicSystem):
         matrices.check(name, inner)

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt32
 
-from jaxprt.brdf import BlinnPhong
+from jaxprt.brdf import BlinnPhong, CookTorrance
 from jaxprt.compile import Between
-from jaxprt.relit.channels import Appearance, Shading, roughness_range
+from jaxprt.relit.channels import Appearance, Changeable, Shading, roughness_range
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
 from jaxprt.scene.environment import add_disk, rotate, sky
@@ -87,7 +87,7 @@ class Stages:
         heights = [_SKY << level for level in range(10) if level == 0 or _SKY << level <= min(rows, finest)]
         return [_latlong(light, height) for height in reversed(heights)]
 
-    def materials(self, look: Look) -> dict[str, TexturedMaterial | BlinnPhong]:
+    def materials(self, look: Look) -> dict[str, Changeable]:
         """The materials that a look changes, by part."""
         parts = {part.name: part for part in self.scene.scene.parts}
         unknown = [name for name, _ in look.material if name not in parts]
@@ -223,6 +223,18 @@ def freedom(shading: Shading, material: Any) -> dict[str, Any] | None:
             "f0": float(specular.max()),
             "specular": (specular / max(specular.max(), 1e-6)).tolist(),
         }
+    if isinstance(material, CookTorrance) and shading.blend is not None:
+        diffuse, specular, f0 = (
+            np.broadcast_to(np.asarray(value, float), (3,))
+            for value in (material.diffuse, material.specular, material.f0)
+        )
+        return {
+            "diffuse": diffuse.tolist(),
+            "roughness": float(material.roughness),
+            "roughness_range": np.exp(standard.COOK_TORRANCE.range).tolist(),
+            "f0": float(f0.max()),
+            "specular": specular.tolist(),
+        }
     if not isinstance(material, TexturedMaterial):
         return None
     free: dict[str, Any] = {"diffuse": np.asarray(material.base_color).tolist()}
@@ -237,7 +249,7 @@ def freedom(shading: Shading, material: Any) -> dict[str, Any] | None:
     return free
 
 
-def change_material(material: Any, name: str, values: Mapping[str, Any]) -> TexturedMaterial | BlinnPhong:
+def change_material(material: Any, name: str, values: Mapping[str, Any]) -> Changeable:
     """The material with other values of roughness, reflectance and colors.
 
     Raises:
@@ -247,6 +259,13 @@ def change_material(material: Any, name: str, values: Mapping[str, Any]) -> Text
         new = {key: jnp.asarray(values[key]) for key in ("diffuse", "exponent") if key in values}
         if "f0" in values or "specular" in values:
             new["specular"] = _tint(material.specular, 1.0, values)
+        return dataclasses.replace(material, **new)
+    if isinstance(material, CookTorrance):
+        names = ("diffuse", "roughness", "specular")
+        new = {key: jnp.asarray(values[key]) for key in names if key in values}
+        if "f0" in values:
+            most = float(jnp.max(material.f0))
+            new["f0"] = material.f0 * (values["f0"] / most) if most > 0 else jnp.full_like(material.f0, values["f0"])
         return dataclasses.replace(material, **new)
     if not isinstance(material, TexturedMaterial):
         raise ValueError(f"the material of part {name!r} is a BRDF, which cannot change in the viewer")

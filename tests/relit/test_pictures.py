@@ -15,13 +15,12 @@ import jaxprt as prt
 from jaxprt import bounces, lobe, visibility
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.image import rasterize
-from jaxprt.relit import Harmonics, Lobes, RelitScene, Terms, canvas, channels, regions
+from jaxprt.relit import Harmonics, Lobes, RelitScene, Terms, canvas, channels
 from jaxprt.relit.exact import exact_picture, exact_pixels
 from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.material import Texture
 from jaxprt.scene.mesh import make_mesh
 from jaxprt.scene.points import Points, on_triangles
-from jaxprt.systems import protocol
 
 SIZE = 8
 CAMERA = Camera([0.6, 2.2, 2.6], [0.0, 0.4, 0.0], [0.0, 1.0, 0.0], 0.9, 20, 16)
@@ -292,52 +291,6 @@ def test_the_exact_picture_has_rays_from_its_own_points():
         glossy.parts[0].mesh, SHARP, light(), eye=camera.eye, occluder=glossy.mesh, points=points
     )
     np.testing.assert_allclose(found.color[0][pixel], expected[0], rtol=0.01)
-
-
-class Where(protocol.System):
-    """Radiance that is the position, of a mesh of two regions whose vertices alternate, beside the number of each."""
-
-    place: tuple[jax.Array, ...]
-
-    def light(self, environment):
-        return environment
-
-    def view(self, eye, materials=None):
-        return materials
-
-    def combine(self, light, view):
-        return jnp.concatenate([each * scale for each, scale in zip(self.place, view, strict=True)])
-
-    def at(self, points):
-        return Where(tuple(own.carry(each) for own, each in zip(points, self.place, strict=True)))
-
-    @property
-    def vertices(self):
-        return sum(map(len, self.place))
-
-
-def test_pictures_of_regions_are_shaded_where_their_pixels_are():
-    # A wall of squares, each of either region, before the eye.
-    edge = np.arange(5) / 2 - 1
-    place = np.stack(np.meshgrid(edge, edge), -1).reshape(-1, 2)
-    quad = np.array([[0, 1, 6], [0, 6, 5]])
-    face = np.concatenate([quad + 5 * row + column for row in range(4) for column in range(4)])
-    side = np.repeat((np.arange(16) // 4 + np.arange(16)) % 2, 2)
-    # Two sets of the same vertices, one for each region, in turns.
-    position = np.repeat(np.pad(place, ((0, 0), (0, 1))), 2, 0)
-    mesh = make_mesh(position, 2 * face + side[:, None], region=np.arange(50) % 2)
-    system = Where(tuple(jnp.asarray(position[number::2], jnp.float32) for number in (0, 1)))
-    camera = Camera([0.0, 0.0, 3.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 2 * np.arctan(1 / 3), 16, 16)
-    black = Environment(jnp.zeros((6, SIZE, SIZE, 3)))
-    for keep in (False, True):
-        view = regions.of_regions(system, mesh, camera, materials=(1.0, 10.0), keep=keep)
-        assert len(view.points) > 1
-        picture = np.asarray(view.picture(black))
-        x = (np.arange(16) + 0.5) / 8 - 1
-        expected = np.stack([*np.meshgrid(x, -x), np.zeros((16, 16))], -1)
-        cell = np.arange(16) // 4
-        expected = expected * np.where((cell[::-1, None] + cell) % 2, 10.0, 1.0)[..., None]
-        np.testing.assert_allclose(picture, expected, atol=1e-4)
 
 
 @contextlib.contextmanager

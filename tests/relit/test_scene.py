@@ -510,7 +510,7 @@ MATERIALS = {
     "kind": (
         {"floor": GLOSSY},
         TypeError,
-        "'floor' must be of class TexturedMaterial or BlinnPhong or Appearance or Blend, which",
+        "'floor' must be of class TexturedMaterial or BlinnPhong or CookTorrance or Appearance or Blend, which",
     ),
     "brdf": ({"ball": wood()}, TypeError, "the material of part 'ball' is a BRDF, which cannot be replaced"),
     "shape": (

@@ -66,7 +66,7 @@ def test_radiance_is_differentiable_in_the_exponent(pair, light):
     [
         (BlinnPhong(0.1, 0.3, 300000.0), ValueError, "must be at most 2e.05, got 3e.05"),
         (TexturedMaterial(), TypeError, "must be a BlinnPhong, got TexturedMaterial"),
-        (Lambert(0.5), TypeError, "or BlinnPhong or Appearance or Blend.* got one of class Lambert"),
+        (Lambert(0.5), TypeError, "or BlinnPhong or CookTorrance or Appearance or Blend.* got one of class Lambert"),
     ],
 )
 def test_what_was_not_precomputed_is_refused(pair, light, material, kind, message):

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxprt.brdf import BlinnPhong, Charlie, Lambert, MetallicRoughness
+from jaxprt.brdf import BlinnPhong, Charlie, CookTorrance, Lambert, MetallicRoughness
 from jaxprt.brdf.varying import Channels
 
 
@@ -39,6 +39,25 @@ class ShininessFamily(eqx.Module):
     def __call__(self, log_roughness: Float[Array, ""] | float) -> Channels:
         """The BRDF for the natural logarithm of a roughness, the square root of 2 / (exponent + 2)."""
         return Channels((Lambert(1.0), BlinnPhong(0.0, 1.0, 2 * jnp.exp(-2 * log_roughness) - 2)), self.scale)
+
+
+class SlopeFamily(eqx.Module):
+    """Maps a root mean square slope m to the BRDF whose channels are the terms of `CookTorrance`.
+
+    The model is linear in F0: it is diffuse / pi + specular (F0 mirror + (1 - F0) rim). The mirror has an F0 of 1, the
+    rim one of 0.
+
+    Attributes:
+        scale: Factor of each channel: base, mirror and rim.
+    """
+
+    scale: Float[Array, " k"]
+
+    def __call__(self, log_roughness: Float[Array, ""] | float) -> Channels:
+        """The BRDF for the natural logarithm of the slope, the roughness of the model."""
+        slope = jnp.exp(log_roughness)
+        mirror, rim = (CookTorrance(0.0, 1.0, slope, f0) for f0 in (1.0, 0.0))
+        return Channels((Lambert(1.0), mirror, rim), self.scale)
 
 
 class SheenFamily(eqx.Module):

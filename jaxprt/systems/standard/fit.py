@@ -1,6 +1,6 @@
 """Fits the tables that are shipped, and writes their files.
 
-    python -m jaxprt.systems.standard.fit [--lobes 12 ...] [--only lobes|harmonics|columns|paths ...] [MATERIAL ...]
+    python -m jaxprt.systems.standard.fit [--lobes 12 ...] [--only lobes|harmonics|...] [MATERIAL ...]
 
 What is not fitted anew stays in the file as it is. Lobes are fitted by EM jointly over roughness and view, and improved
 by descent at roughnesses whose lobes are wide enough for its quadrature. Errors are those of the rounded numbers.
@@ -19,12 +19,12 @@ from jaxtyping import Float
 from jaxprt.brdf import MetallicRoughness, sheen
 from jaxprt.brdf.varying import Channels
 from jaxprt.sphere import hemisphere
-from jaxprt.systems import bounces, bright_texels, harmonic, lobe
+from jaxprt.systems import bounces, bright_texels, dynamic, harmonic, lobe
 from jaxprt.systems.bounces import traced
 from jaxprt.systems.lobe import LobeBrdf, em
 from jaxprt.systems.lobe.table import measured_error, sampled
 from jaxprt.systems.standard import descent, tables
-from jaxprt.systems.standard.families import RoughnessFamily, SheenFamily, ShininessFamily
+from jaxprt.systems.standard.families import RoughnessFamily, SheenFamily, ShininessFamily, SlopeFamily
 
 COUNTS = (4, 8, 12, 24)  # numbers of lobes; others are fitted by who asks for them
 KNOTS, FEW = 20, 10  # FEW for lobes of sheens, which are wide
@@ -37,7 +37,8 @@ _RINGS, _SECTORS = 96, 64  # quadrature of the zonal harmonics
 _VIEW = np.array([0.6, 0.0, 0.8], np.float32)
 _FUNCTIONS, _TERMS, _RESOLUTION = 2, 24, 32  # of light paths
 _WIDTH = 0.09  # smallest alpha of lobes along light paths
-_DIFFUSE = (0, 3)  # channels of metallic-roughness without lobes
+_DIFFUSE = (0, 3)  # channels of metallic-roughness and Cook-Torrance without lobes
+_SENDING = ("metallic_roughness", "cook_torrance")  # materials whose functions of light paths are shipped
 _DARK = 1e-6
 
 
@@ -55,7 +56,7 @@ class Material(NamedTuple):
         knot_count: Number of knots of everything but the harmonics.
     """
 
-    family: RoughnessFamily | ShininessFamily | SheenFamily
+    family: RoughnessFamily | ShininessFamily | SlopeFamily | SheenFamily
     scale: np.ndarray
     smoothest: float
     weight: np.ndarray
@@ -79,6 +80,11 @@ def material(name: str) -> Material:
         # Every other one has no diffuse base.
         weight = np.concatenate([base * (np.arange(60) % 2)[:, None], other], 1) / scale
         return Material(ShininessFamily(jnp.asarray(scale)), scale, 10**-2.5, weight, 0.1, _spread(10**-2.5, 1), 1)
+    if name == "cook_torrance":
+        scale, f0 = np.array([0.1, 1.0, 1.0], np.float32), np.linspace(0, 1, 60, dtype=np.float32)[:, None]
+        rows = [base * (np.arange(60) % 2)[:, None], other * f0, other * (1 - f0)]
+        weight = np.concatenate(rows, 1) / scale
+        return Material(SlopeFamily(jnp.asarray(scale)), scale, 10**-2.5, weight, 0.3, _spread(10**-2.5, 1), 1)
     if name == "sheen":
         scale, knot = np.ones(1, np.float32), _spread(sheen.SMOOTHEST, 1)
         return Material(SheenFamily(jnp.asarray(scale)), scale, sheen.SMOOTHEST, base, sheen.SMOOTHEST, knot, 1, FEW)
@@ -129,7 +135,9 @@ def between(knot: np.ndarray) -> np.ndarray:
     return np.interp(np.arange(2 * len(knot) - 1) / 2, np.arange(len(knot)), knot)
 
 
-def errors(table: LobeBrdf, family: RoughnessFamily | ShininessFamily | SheenFamily, places: np.ndarray) -> np.ndarray:
+def errors(
+    table: LobeBrdf, family: RoughnessFamily | ShininessFamily | SlopeFamily | SheenFamily, places: np.ndarray
+) -> np.ndarray:
     """Error of a table at each of some roughnesses, under natural light, of the sum of all channels."""
     each = (jnp.asarray(place, table.scale.dtype) for place in places)
     return np.array([measured_error(family(place), table.at(place)) for place in each])
@@ -169,6 +177,19 @@ def columns(made: Material, table: LobeBrdf) -> dict[str, np.ndarray]:
     return held | {"samples": np.array(samples, np.uint8), "samples.knot": place.astype(np.float32)}
 
 
+def tensor(made: Material, table: LobeBrdf) -> dict[str, np.ndarray]:
+    """Arrays of the tensor for what the lobes of a table leave, and what its diffuse part is to be changed by."""
+    brdf = dynamic.table.tabulate(made.family, lobes=table, ranks=tables.RANKS, knot=(made.knots,))
+    return {
+        "tensor.core": np.asarray(brdf.core, np.float32),
+        "tensor.factor": np.asarray(brdf.factor, np.float32),
+        "tensor.view": np.asarray(brdf.view_map).astype(np.float16),
+        "tensor.light": np.asarray(brdf.light_map).astype(np.float16),
+        "tensor.diffuse": (np.asarray(brdf.lobe.diffuse) - np.asarray(table.diffuse)).astype(np.float16),
+        "tensor.error": np.asarray(brdf.error, np.float32),
+    }
+
+
 def _zonal(brdf: Channels) -> Float[np.ndarray, "l k"]:
     """Zonal harmonics of BRDF x cosine about the mirror direction; see `jaxprt.relit.interpolation.curvature`."""
     mirror = _VIEW * [-1, -1, 1]
@@ -183,7 +204,7 @@ def paths(made: Material) -> dict[str, np.ndarray]:
     """Functions of light paths for all roughnesses, and their weights; see `jaxprt.relit.paths.factored`."""
     scale = np.asarray(made.scale, np.float64)
     matte = np.isin(np.arange(len(scale)), _DIFFUSE)
-    place = np.maximum(made.knots, np.log(_WIDTH) / 2)
+    place = np.maximum(made.knots, np.log(_WIDTH) / made.power)
     first = np.flatnonzero(np.append(np.diff(place) > 0, True))
     wide = [made.family(jnp.asarray(each)) for each in place[first]]
     wide = [Channels(tuple(np.array(each.model, object)[~matte]), jnp.ones(int((~matte).sum()))) for each in wide]
@@ -214,8 +235,9 @@ def _albedo(brdf: Channels) -> np.ndarray:
 def main(options: Sequence[str]) -> None:
     """Writes the files."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    names = tables.METALLIC_ROUGHNESS.name, tables.BLINN_PHONG.name, tables.SHEEN.name
-    kinds = "lobes", "harmonics", "columns", "paths"
+    standard = tables.METALLIC_ROUGHNESS, tables.BLINN_PHONG, tables.COOK_TORRANCE, tables.SHEEN
+    names = [table.name for table in standard]
+    kinds = "lobes", "harmonics", "columns", "paths", "tensor"
     parser.add_argument("material", nargs="*", help=", ".join(names))
     parser.add_argument("--lobes", type=int, nargs="*", default=COUNTS)
     parser.add_argument("--only", nargs="*", default=kinds, choices=kinds)
@@ -229,8 +251,10 @@ def main(options: Sequence[str]) -> None:
             _add(name, _timed(harmonics, made))
         if "columns" in arguments.only:
             _add(name, _timed(columns, made, tables.StandardTable(name).lobes()))
-        if "paths" in arguments.only and name == names[0]:
+        if "paths" in arguments.only and name in _SENDING:
             _add(name, _timed(paths, made))
+        if "tensor" in arguments.only and name != tables.SHEEN.name:
+            _add(name, _timed(tensor, made, tables.StandardTable(name).lobes(tables.TENSOR_LOBES)))
 
 
 def _timed(function, *argument):

@@ -19,6 +19,7 @@ from jaxprt import require
 from jaxprt.brdf import GGX, Charlie, CoatedModel, MetallicRoughness, UnderSheen, coat_reflectance, sheen_albedo
 from jaxprt.brdf.varying import Channels
 from jaxprt.systems.bounces.varying import Sent
+from jaxprt.systems.dynamic.table import DynamicBrdf
 from jaxprt.systems.harmonic import HarmonicBrdf
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.separable import SeparableBrdf
@@ -135,6 +136,19 @@ class LayeredTable(StandardTable):
         require.count("count", count, least=1)
         return _lobes(self.over, int(count), jnp.result_type(float))
 
+    def has_tensor(self, lobes: int, ranks: tuple[int, int, int] | None) -> bool:
+        """Whether there are lobes, and the table of the base has such a tensor."""
+        return METALLIC_ROUGHNESS.has_tensor(lobes, ranks) and lobes in self.layer.table.counts
+
+    def tensor(
+        self, lobes: int = tables.TENSOR_LOBES, ranks: tuple[int, int, int] | None = tables.RANKS
+    ) -> DynamicBrdf:
+        """The BRDF as lobes, a diffuse part and a tensor: `lobes` for the base, and as many for the layer.
+
+        The tensor is that of the base, with the mean of what a layer takes. The layer has lobes alone.
+        """
+        return _tensor(self.over, int(lobes), ranks, jnp.result_type(float))
+
     def harmonics(self, degree: int = tables.DEGREE) -> HarmonicBrdf:
         """The BRDF in spherical harmonics up to a degree."""
         return _harmonics(self.over, degree, jnp.result_type(float))
@@ -202,8 +216,24 @@ def _under(base: Any, layer: Any, taken: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def _lobes(over: str, count: int, dtype: Any) -> LobeBrdf:
+    return _layered_lobes(_LAYERS[over], METALLIC_ROUGHNESS.lobes(count), _LAYERS[over].table.lobes(count), dtype)
+
+
+@functools.cache
+def _tensor(over: str, count: int, ranks: tuple[int, int, int] | None, dtype: Any) -> DynamicBrdf:
     layer = _LAYERS[over]
-    base, own = METALLIC_ROUGHNESS.lobes(count), layer.table.lobes(count)
+    base = METALLIC_ROUGHNESS.tensor(count, ranks)
+    lobes, factor = _layered_lobes(layer, base.lobe, layer.table.lobes(count), dtype), np.asarray(base.factor)
+    taken = layer.taken(_VIEWS, layer.table.knot).mean(1)[:, None, None]
+    shape = (len(factor), len(taken), *factor.shape[1:])
+    rows = np.broadcast_to(factor[:, None], shape)
+    none = np.zeros_like(rows[:, :, :1])
+    whole = tables.constant(np.concatenate([rows, rows * (1 - taken), none], 2), dtype=dtype)
+    return DynamicBrdf(lobes, base.core, whole, base.view_map, base.light_map, base.error)
+
+
+def _layered_lobes(layer: _Layer, base: LobeBrdf, own: LobeBrdf, dtype: Any) -> LobeBrdf:
+    """The lobes of the base, and those of the layer."""
     cosine = _cosine(np.linspace(0, 1, base.scale.shape[-1]))
     taken, sent = layer.taken(cosine, layer.table.knot), layer.sent(cosine)
     strength, matte = (np.asarray(each)[[layer.channel]] * sent for each in (own.weight, own.diffuse))

@@ -1,9 +1,10 @@
-"""Tables of metallic-roughness and Blinn-Phong materials and of sheens over roughness, fitted once and shipped.
+"""Tables of metallic-roughness, Blinn-Phong and Cook-Torrance materials and of sheens over roughness, shipped.
 
 Each material has one file. `jaxprt.systems.standard.fit` writes it. Reading runs on the host: it compiles no program.
 Numbers are stored in half precision, directions in 16-bit fixed point.
 """
 
+import dataclasses
 import functools
 import pathlib
 from collections.abc import Mapping
@@ -17,17 +18,19 @@ from jaxtyping import Float
 
 from jaxprt import require
 from jaxprt.sphere import harmonics, hemisphere
-from jaxprt.systems import lobe
+from jaxprt.systems import dynamic, lobe
 from jaxprt.systems.bounces import traced
 from jaxprt.systems.bounces.varying import Sent
+from jaxprt.systems.dynamic.table import DynamicBrdf
 from jaxprt.systems.harmonic import HarmonicBrdf
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.separable import SeparableBrdf
-from jaxprt.systems.standard.families import RoughnessFamily, SheenFamily, ShininessFamily
+from jaxprt.systems.standard.families import RoughnessFamily, SheenFamily, ShininessFamily, SlopeFamily
 
 LOBES = 12  # default number of lobes
 DEGREE = 4  # of the harmonics
 UNIT = 32767  # a component of 1 of a direction, in fixed point
+TENSOR_LOBES, RANKS = 12, (4, 8, 8)  # of the tensors that are shipped: number of lobes beside, and ranks
 TEXELS = 64  # edge of the cubemap faces for which numbers of samples are stored
 
 
@@ -81,11 +84,13 @@ class StandardTable:
         return tuple(sorted(int(name[5:-5]) for name in names))
 
     @property
-    def family(self) -> RoughnessFamily | ShininessFamily | SheenFamily:
+    def family(self) -> RoughnessFamily | ShininessFamily | SlopeFamily | SheenFamily:
         """Function from the logarithm of a roughness to the BRDF with all channels."""
         scale = constant(self._stored["channel"])
         if self.name == "blinn_phong":
             return ShininessFamily(scale)
+        if self.name == "cook_torrance":
+            return SlopeFamily(scale)
         if self.name == "sheen":
             return SheenFamily(scale)
         return RoughnessFamily(tuple(range(len(scale))), scale, constant(np.zeros(())))
@@ -120,14 +125,35 @@ class StandardTable:
             raise ValueError(f"degree must be between 0 and the table's {most}, got {degree}")
         return _harmonics(self, degree, _dtype())
 
+    def has_tensor(self, lobes: int, ranks: tuple[int, int, int] | None) -> bool:
+        """Whether a tensor of these ranks is shipped for what so many lobes leave; without ranks, whether lobes are."""
+        if ranks is None:
+            return lobes in self.counts
+        return lobes == TENSOR_LOBES and tuple(ranks) == RANKS and "tensor.core" in self._stored
+
+    def tensor(self, lobes: int = TENSOR_LOBES, ranks: tuple[int, int, int] | None = RANKS) -> DynamicBrdf:
+        """The BRDF as lobes, a diffuse part and a tensor, for the dynamic system.
+
+        Args:
+            lobes: Number of lobes.
+            ranks: Ranks of the tensor; None for lobes alone. Other sizes than the shipped ones are fitted when they are
+                first asked for, and kept for this process.
+        """
+        return _tensor(self, int(lobes), None if ranks is None else tuple(ranks), _dtype())
+
+    @property
+    def has_paths(self) -> bool:
+        """Whether the functions of light paths are shipped."""
+        return "path.view" in self._stored
+
     def paths(self) -> tuple[SeparableBrdf, Sent]:
         """The functions with which parts send light to others, and their weights over roughness.
 
         Raises:
-            ValueError: The file holds none; only that of metallic-roughness does.
+            ValueError: The file holds none; see `has_paths`.
         """
-        if "path.view" not in self._stored:
-            raise ValueError(f"functions of light paths are shipped for metallic_roughness, got {self.name}")
+        if not self.has_paths:
+            raise ValueError(f"no functions of light paths are shipped for {self.name}")
         return _paths(self, _dtype())
 
     def curvature(self, log_roughness: float, weight: Float[np.ndarray, " k"], degree: int | None = None) -> float:
@@ -189,6 +215,7 @@ class StandardTable:
 
 METALLIC_ROUGHNESS = StandardTable("metallic_roughness")
 BLINN_PHONG = StandardTable("blinn_phong")
+COOK_TORRANCE = StandardTable("cook_torrance")
 SHEEN = StandardTable("sheen")
 
 
@@ -204,7 +231,7 @@ def path(name: str) -> pathlib.Path:
 
 def forget() -> None:
     """Forgets the tables of this process, so that the next use reads them again."""
-    for each in (_read, _lobes, _harmonics, _paths):
+    for each in (_read, _lobes, _tensor, _harmonics, _paths):
         each.cache_clear()
 
 
@@ -227,6 +254,23 @@ def _lobes(table: StandardTable, count: int, dtype: Any) -> LobeBrdf:
         constant(np.asarray(np.max(table.errors(count))), dtype=dtype),
     )
     return LobeBrdf(constant(mean / np.linalg.norm(mean, axis=0), dtype=dtype), scale, weight, diffuse, (knot,), error)
+
+
+@functools.cache
+def _tensor(table: StandardTable, lobes: int, ranks: tuple[int, int, int] | None, dtype: Any) -> DynamicBrdf:
+    if not table.has_tensor(lobes, ranks):
+        with jax.ensure_compile_time_eval():
+            knot = (np.asarray(table._stored["knot"]),)
+            return dynamic.table.tabulate(
+                table.family, lobes=table.lobes(lobes) if lobes else 0, ranks=ranks, knot=knot
+            )
+    if ranks is None:
+        return dynamic.table.without_tensor(table.lobes(lobes))
+    held = table.lobes(lobes)
+    diffuse = constant(np.asarray(held.diffuse) + table._stored["tensor.diffuse"], dtype=dtype)
+    names = "core", "factor", "view", "light", "error"
+    rows = (constant(table._stored[f"tensor.{name}"], dtype=dtype) for name in names)
+    return DynamicBrdf(dataclasses.replace(held, diffuse=diffuse), *rows)
 
 
 @functools.cache
