@@ -13,19 +13,19 @@ import click
 from click.shell_completion import CompletionItem
 
 from jaxprt.cli import inputs
-from jaxprt.relit import Clusters, Harmonics, Lobes, Terms
+from jaxprt.relit import Clusters, Dynamic, Harmonics, Lobes, Terms
 from jaxprt.relit.recipes import Recipe
 
 LAPLACIAN = {"none": 1.0, "laplacian": 0.4}  # fraction of the squared Laplacian that each window preserves
-NAMES = ("lobe", "harmonic", "separable", "clusters")
+NAMES = ("lobe", "harmonic", "separable", "clusters", "dynamic")
 _COUNT = 12  # default number of lobes
 _TAKEN = {
-    "lobes": ("lobe",),
-    "texels": ("lobe", "clusters"),
-    "terms": ("separable", "clusters", "dynamic"),
-    "keep": ("separable", "clusters"),
-    "components": ("clusters",),
-    "modes": ("clusters",),
+    "lobes": ("lobe", "dynamic"),
+    "texels": ("lobe", "clusters", "dynamic"),
+    "terms": ("separable", "clusters"),
+    "keep": ("separable", "clusters", "dynamic"),
+    "components": ("clusters", "dynamic"),
+    "modes": ("clusters", "dynamic"),
 }
 _PATH: Any = click.Path(path_type=Path)
 
@@ -52,9 +52,24 @@ def recipes(system: str, options: SimpleNamespace, *, lobes: int = _COUNT) -> di
         return {name: Lobes(count, **more) for name, count in zip(names, counts, strict=True)}
     if system == "harmonic":
         return {system: Harmonics(options.order - 1, LAPLACIAN[options.window])}
+    if system == "dynamic":
+        return _dynamic(options)
     names = ("terms", "keep") if system == "separable" else ("terms", "keep", "components", "modes", "texels")
     values = {name: value for name in names if (value := getattr(options, name)) is not None}
     return {system: Terms(**values) if system == "separable" else Clusters(**values)}
+
+
+def _dynamic(options: SimpleNamespace) -> dict[str, Recipe]:
+    """Recipes of the dynamic system. Other numbers of lobes than by default have no tensor."""
+    names = ("keep", "components", "modes", "texels")
+    values = {name: value for name in names if (value := getattr(options, name, None)) is not None}
+    counts, whole = options.lobes or (), Dynamic(**values)
+    if not counts:
+        return {"dynamic": whole}
+    names = ["dynamic"] if len(counts) == 1 else [f"dynamic_{count}" for count in counts]
+    ranks = [whole.ranks if count == whole.lobes else None for count in counts]
+    rows = zip(names, counts, ranks, strict=True)
+    return {name: Dynamic(lobes=count, ranks=rank, **values) for name, count, rank in rows}
 
 
 class Command(click.Command):
@@ -373,14 +388,14 @@ few_sizes = together(
         group="Sizes",
         type=Several(Whole(1, 64)),
         metavar="N,..",
-        help="Lobes per BRDF (lobe). Several numbers make several systems.  [default: 12]",
+        help="Lobes per BRDF (lobe, dynamic). Several numbers make several systems.  [default: 12]",
     ),
     option(
         "--texels",
         group="Sizes",
         type=Whole(0),
         metavar="N",
-        help="Brightest texels that are summed one by one (lobe, clusters).  [default: 16]",
+        help="Brightest texels that are summed one by one (lobe, clusters, dynamic).  [default: 16]",
     ),
     option(
         "--order",
@@ -413,21 +428,22 @@ _more_sizes = together(
         group="Sizes",
         type=Whole(1),
         metavar="N",
-        help="Wavelet coefficients.  [default: 96 per vertex and term for separable, 768 per cluster for clusters]",
+        help="Wavelet coefficients.  [default: 96 per vertex and term for separable, 768 per cluster for clusters, "
+        "1024 for dynamic]",
     ),
     option(
         "--components",
         group="Sizes",
         type=Whole(1),
         metavar="N",
-        help="Principal components along the vertices of each cluster (clusters).  [default: 16]",
+        help="Principal components along the vertices of each cluster.  [default: 16 for clusters, 24 for dynamic]",
     ),
     option(
         "--modes",
         group="Sizes",
         type=Whole(1),
         metavar="N",
-        help="Principal components along the light of each cluster (clusters).  [default: 80]",
+        help="Principal components along the light of each cluster.  [default: 80 for clusters, 128 for dynamic]",
     ),
 )
 recipe = together(few_sizes, _more_sizes)

@@ -27,7 +27,9 @@ _PATIENCE = 0.5  # seconds; `jaxprt.cli.main.run` ends a process whose threads s
 @click.command(cls=options.Command, short_help="Show a scene in the interactive viewer in a browser.")
 @options.scene
 @options.light
-@options.systems(("lobe", "harmonic"), default="lobe", words="One, or both to switch by a key.  [default: lobe]")
+@options.systems(
+    ("lobe", "harmonic", "dynamic"), default="lobe", words="One, or several to switch by a key.  [default: lobe]"
+)
 @option(
     "--bounces",
     group="System",
@@ -141,12 +143,10 @@ def ready(chosen: SimpleNamespace) -> tuple[dict[str, RelitScene], dict[str, Env
     scene, lights = inputs.scene(chosen, playable=True), inputs.lights(chosen)
     systems = {}
     for system in chosen.system:
-        recipes = options.recipes(system, chosen, lobes=LOBES)
-        for recipe in recipes.values():
-            shown = f"{recipe.lobes} lobes" if system == "lobe" else "harmonics"  # pyright: ignore
-            path = (
-                None if chosen.output is None else chosen.output / system
-            )  # shared by systems with any number of lobes
+        for name, recipe in options.recipes(system, chosen, lobes=LOBES).items():
+            shown = {"lobe": f"{getattr(recipe, 'lobes', 0)} lobes", "harmonic": "harmonics"}.get(system, name)
+            # A folder is shared by systems with any number of lobes.
+            path = None if chosen.output is None else chosen.output / system
             systems[shown] = precompute_scene(scene, lights, recipe, chosen.bounces, path)
     return systems, lights
 

@@ -22,7 +22,7 @@ from jaxprt.image.tonemap import TONES
 from jaxprt.relit.planning import Plan
 from jaxprt.visibility import blocks
 
-SYSTEMS = ("planned", *options.NAMES, "dynamic")
+SYSTEMS = ("planned", *options.NAMES)
 
 
 @click.command(cls=options.Command, short_help="Render a scene under lights, and measure errors.")
@@ -51,7 +51,7 @@ SYSTEMS = ("planned", *options.NAMES, "dynamic")
     group="Output",
     type=options.Whole(2),
     metavar="N",
-    help="Write N pictures with changing light, view and materials (dynamic).",
+    help="Write N pictures by each system with changing light, view and materials.",
 )
 @option(
     "--table",
@@ -111,19 +111,14 @@ def _run(chosen: SimpleNamespace) -> dict[str, Any]:
     summary = _describe(view, chosen)
     names = ", ".join(f"{part.name} {len(part.mesh.position)}" for part in view.scene.parts)
     click.echo(f"jaxprt {summary['machine']['jaxprt']}: {names} vertices")
-    candidates, changing = {}, None
+    candidates: dict[str, SystemScene] = {}
     for system in systems:
-        if system == "dynamic":
-            count = 2 if chosen.bounces is None else chosen.bounces
-            terms = chosen.terms or 4
-            changing = animation.prepare(view, chosen.output, terms=terms, reflections=count)
-            candidates[system] = animation.made(changing, view)
-        else:
-            candidates |= _precompute(system, view, chosen, plan)
+        candidates |= _precompute(system, view, chosen, plan)
     summary["precompute"] = {system: candidate.cost for system, candidate in candidates.items()}
     _draw(summary, view, candidates, chosen.output)
-    if changing is not None and chosen.animate:
-        animation.animate(changing, view, chosen.output, frames=chosen.animate)
+    for system, candidate in candidates.items() if chosen.animate else ():
+        folder = chosen.output / ("animation" if len(candidates) == 1 else f"animation_{system}")
+        animation.animate(candidate.system, view, folder, frames=chosen.animate)
     summary["times"] = {system: report.times(view, candidate) for system, candidate in candidates.items()}
     if chosen.table:
         vertex = report.sample(view, chosen.table)
@@ -162,14 +157,11 @@ def _systems(chosen: SimpleNamespace) -> tuple[str, ...]:
     for name, value, system in (
         ("--error", chosen.error, "planned"),
         ("--plan", chosen.saved, "planned"),
-        ("--animate", chosen.animate, "dynamic"),
     ):
         if value is not None and system not in systems:
             raise click.UsageError(f"{name} needs --system {system}, got {','.join(systems)}")
     if chosen.error is not None and chosen.saved is not None:
         raise click.UsageError("--plan has its own error: give --error or --plan, got both")
-    if chosen.part is not None and "dynamic" in systems:
-        raise click.UsageError("--part needs systems other than dynamic, got dynamic")
     return systems
 
 

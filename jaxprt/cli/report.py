@@ -18,14 +18,14 @@ from jaxtyping import Array
 from jaxprt import files, image, relit, visibility
 from jaxprt.files import objects
 from jaxprt.image import pixels
-from jaxprt.relit import measuring, regions
+from jaxprt.relit import measuring
 from jaxprt.relit.channels import Shading, of_part
 from jaxprt.relit.exact import ExactPicture, ExactPixels, exact_picture, exact_pixels
 from jaxprt.relit.exact_lamps import Lamps
 from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.recipes import Known, Recipe, Target, harmonic_table
-from jaxprt.relit.regions import RegionsView
-from jaxprt.scene import Camera, Environment, Mesh, Scene, sides
+from jaxprt.relit.scene import RelitScene
+from jaxprt.scene import Camera, Environment, Scene, sides
 from jaxprt.scene.scene import centered
 from jaxprt.systems import harmonic, protocol, reference
 from jaxprt.systems.harmonic import HarmonicSystem, TransferMatrix
@@ -65,37 +65,27 @@ class SystemScene(NamedTuple):
     """A scene that one system has precomputed.
 
     Attributes:
-        direct: System of all vertices for direct light, to compare with exact pictures: a `RelitScene`, or a system
-            that takes points of the regions of the mesh.
+        direct: The scene with direct light alone, to compare with exact pictures.
         system: The same including bounces; equal to `direct` if there are none.
-        mesh: The mesh of all parts.
-        materials: Materials used for relighting.
         cost: Costs of the precomputation, for the report.
     """
 
-    direct: System
-    system: System
-    mesh: Mesh
-    materials: Any
+    direct: RelitScene
+    system: RelitScene
     cost: dict[str, Any]
 
     def color(self, light: Environment, eye: Array) -> Array:
         """Radiance of the vertices of the scene's file under direct light."""
-        color = protocol.radiance(self.direct, light, eye=eye, materials=self.materials)
-        return color[self.direct.file_vertex] if isinstance(self.direct, relit.RelitScene) else color
+        return protocol.radiance(self.direct, light, eye=eye)[self.direct.file_vertex]
 
-    def view(self, camera: Camera, *, reflected: bool = False) -> PictureView | RegionsView:
+    def view(self, camera: Camera, *, reflected: bool = False) -> PictureView:
         """The part of a picture that does not depend on the light, for direct light or with bounces."""
-        system = self.system if reflected else self.direct
-        if isinstance(system, relit.RelitScene):
-            return system.picture_view(camera)
-        keep = camera.width * camera.height <= _KEPT
-        return regions.of_regions(system, self.mesh, camera, materials=self.materials, keep=keep)
+        return (self.system if reflected else self.direct).picture_view(camera)
 
     def pictures(self, lights: list[Environment], camera: Camera, *, reflected: bool = False) -> list[Array]:
         """Pictures under several lights, for direct light or with bounces."""
         system = self.system if reflected else self.direct
-        if isinstance(system, relit.RelitScene) and camera.width * camera.height > _KEPT:
+        if camera.width * camera.height > _KEPT:
             return [system.picture(light, camera) for light in lights]
         seen = self.view(camera, reflected=reflected)
         return [seen.picture(light) for light in lights]
@@ -165,7 +155,7 @@ def _precompute(view: View, output: Path, **options: Any) -> SystemScene:
         raise ValueError(f"{error}; on the command line, name another --output" if existed else str(error)) from error
     direct = ready.without_bounces()
     cost = {"seconds": timeit.default_timer() - start, "bytes": ready.nbytes}
-    return SystemScene(direct, direct if ready.bounces is None else ready, direct.mesh, None, cost)
+    return SystemScene(direct, direct if ready.bounces is None else ready, cost)
 
 
 def draw(view: View, reports: dict[str, SystemScene]) -> dict[str, list[Array]]:

@@ -243,7 +243,7 @@ def test_ctrl_c_ends_a_process_with_130_and_without_a_traceback(place):
     assert err == "jaxprt: stopped; the same command goes on from here\n"
 
 
-def test_only_relight_knows_its_systems():
+def test_relight_knows_all_systems():
     assert set(relight.SYSTEMS) == {"planned", "lobe", "harmonic", "separable", "clusters", "dynamic"}
 
 

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import jaxprt as prt
-from jaxprt.cli import animation
 from jaxprt.cli import report as cli_report
 from jaxprt.cli.main import program
 
@@ -51,14 +50,10 @@ def small(coarse, bound):
             (prt.harmonic.precompute_diffuse, {"size": 8}),
             (prt.harmonic.tabulate, {"resolution": 8, "error": 1.0}),
             (prt.lobe.tabulate, {"resolution": 8}),
-            (prt.bounces.factor, {"functions": 2, "terms": 4, "resolution": 8}),
             (prt.scene.mesh.ground_plane, {"vertices": 49}),
-            (prt.dynamic.precompute, {"size": 8}),
             (prt.bounces.precompute, {"edge": 2, "size": 8, "components": 8, "modes": 8}),
         ):
             bound(patch, function, **limits)
-        for name, value in (("LOBES", 1), ("ROUGHNESS", (0.3, 0.5, 0.5))):
-            patch.setattr(animation, name, value)
         patch.setattr(cli_report, "PIXELS", 200)
         yield
 
@@ -267,8 +262,11 @@ def test_bad_files_are_named_on_stderr_with_status_2(place, tmp_path, capsys, op
         (["--keep", "0"], "'--keep': must be a whole number of at least 1, got 0"),
         (["--keep", "30000"], "--keep must be at most 384, got 30000"),
         (["--terms", "0"], "'--terms': must be a whole number of at least 1, got 0"),
-        (["--lobes", "6"], "--lobes needs --system lobe, got separable"),
-        (["--modes", "6", "--system", "lobe,harmonic"], "--modes needs --system clusters, got lobe,harmonic"),
+        (["--lobes", "6"], "--lobes needs --system lobe or dynamic, got separable"),
+        (
+            ["--modes", "6", "--system", "lobe,harmonic"],
+            "--modes needs --system clusters or dynamic, got lobe,harmonic",
+        ),
         (["--brdf", "ashikhmin-shirley", "--terms", "3000"], "terms must be between 1 and .* got 3000"),
         (["--brdf", "velvet"], "must be one of lambert, phong, .* got 'velvet'"),
         (["--brdf", "ward:along=nan"], "along of ward must be a finite number, got 'nan'"),
@@ -293,10 +291,7 @@ def test_bad_files_are_named_on_stderr_with_status_2(place, tmp_path, capsys, op
             ([f"--part={part}"], f"--part must be K/N.* got {part}")
             for part in ("0/4", "5/4", "a/b", "2", "-1/2", "1/0")
         ),
-        (["--part", "1/2", "--system", "dynamic"], "--part needs systems other than dynamic, got dynamic"),
-        (["--animate", "4"], "--animate needs --system dynamic"),
-        (["--system", "dynamic"], "needs a part that can change: give --brdf or --material cook-torrance"),
-        (["--system", "dynamic", "--animate", "1"], "'--animate': must be a whole number of at least 2, got 1"),
+        (["--animate", "1"], "'--animate': must be a whole number of at least 2, got 1"),
         (["--material", "7=lambert"], "--material must name one of the parts 0 'mesh', got '7'"),
         (["--material", "lambert"], "must be PART=MATERIAL, such as .* got 'lambert'"),
     ],
@@ -386,16 +381,14 @@ def test_two_skies_of_one_name_are_both_relit(place, glossy):
     assert np.abs(first - second).max() > 0.1
 
 
-@pytest.mark.parametrize("system", [("separable",), ("dynamic", "--brdf", "cook-torrance")])
 @pytest.mark.parametrize(("mesh", "count"), [("mesh.obj", 0), ("inside_out.obj", 1)])
-def test_only_an_inside_out_mesh_is_warned_of(place, tmp_path, monkeypatch, capsys, mesh, count, system):
+def test_only_an_inside_out_mesh_is_warned_of(place, tmp_path, monkeypatch, capsys, mesh, count):
     swapped = re.sub(r"^f (\d) (\d) (\d)$", r"f \1 \3 \2", OBJ, flags=re.MULTILINE)
     (place / "inside_out.obj").write_text(swapped)
     monkeypatch.setattr(prt.separable, "factor", stop)
-    monkeypatch.setattr(prt.dynamic, "separate", stop)
     with warnings.catch_warnings():
         warnings.simplefilter("default")
-        assert run(place, "--system", *system, mesh=mesh, output=tmp_path) == 130
+        assert run(place, "--system", "separable", mesh=mesh, output=tmp_path) == 130
     warned = [line for line in capsys.readouterr().err.splitlines() if line.startswith("Warning: ")]
     assert len(warned) == count
     assert not count or re.search(r"sees 100% of part .* from behind, and backs are black: .* inside out", warned[0])
@@ -409,7 +402,7 @@ def test_the_module_runs_as_a_program():
     assert not done.stderr
 
 
-def test_materials_that_change_are_relit_with_bounces_and_animated(place, capsys):
+def test_materials_that_change_are_relit_with_bounces_and_animated_by_every_system(place, capsys):
     output = place / "moving"
     glossy = ["--material", "mesh=cook-torrance:diffuse=.5,specular=.6/.5/.3,roughness=.4"]
     several = ["--system", "dynamic,lobe", "--bounces", "2"]
@@ -417,10 +410,9 @@ def test_materials_that_change_are_relit_with_bounces_and_animated(place, capsys
     told = report(output)
     for system in ("dynamic", "lobe"):
         assert 0.03 < told["lights"]["sky"][system]["reflected_fraction"] < 0.2
-    assert told["lights"]["sky"]["dynamic"]["picture_error"] < 0.3
-    assert told["precompute"]["dynamic"]["scene"]["bounces_worth"][0] > 0.01
-    frames = [prt.files.read_image(output / "animation" / f"frame_{n:04d}.png")[0] for n in range(2)]
-    assert np.abs(frames[0] - frames[1]).max() > 0.05
+        assert told["lights"]["sky"][system]["picture_error"] < 0.3
+        frames = [prt.files.read_image(output / f"animation_{system}" / f"frame_{n:04d}.png")[0] for n in range(2)]
+        assert np.abs(frames[0] - frames[1]).max() > 0.05
     whole, direct = (prt.files.read_image(output / f"sky_{name}.exr")[0] for name in ("dynamic_bounces", "dynamic"))
     assert whole.mean() > direct.mean()
     assert "comes from other surfaces" in capsys.readouterr().out

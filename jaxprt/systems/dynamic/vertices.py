@@ -17,7 +17,7 @@ from jaxprt.systems.dynamic.table import DynamicBrdf
 from jaxprt.systems.lobe import LobeTransport
 from jaxprt.systems.separable import ClusteredTransport, SeparableBrdf
 from jaxprt.visibility import StoredVisibility
-from jaxprt.visibility.arguments import PRECOMPUTE
+from jaxprt.visibility.rays import PRECOMPUTE
 
 _MEMBERS = 230  # number of vertices of a cluster in a large mesh
 _CLUSTERS = 64  # number of clusters of a smaller mesh, if each then has at least
