@@ -55,7 +55,7 @@ def _escape_raised(direction, point, normal, distance, height):
 
 def _grooved_profile(distance, height):
     """Points, normals and lengths of one period around a groove."""
-    count = 10 * SAMPLES
+    count = 2 * SAMPLES
     half_width = min(np.sqrt(1 - height**2), distance / 2)
     step = (np.arange(count) + 0.5) / count
     angle = np.arcsin(half_width) * (2 * step - 1)
