@@ -62,6 +62,9 @@ def exact(transport, brdf, light, eye=EYE):
     return reference.integrate(seen, transport.position, transport.frame, brdf, light, eye, error=np.inf)
 
 
+shine = jax.jit(bright_texels.radiance)  # one program; outside of programs it looks at values as well
+
+
 @jax.jit
 def weighed(brdf, excess, eye, texel, transport, weight):
     """A sum over vertices and colors, with its slopes by the BRDF, the excess and the eye."""
@@ -160,7 +163,7 @@ def test_a_light_of_float32_keeps_its_type_where_float64_is_enabled(sky, x64):
 def test_none_have_no_radiance(mesh, transport, part):
     count = 0 if part == "texels" else COUNT
     lit = precompute(mesh, size=SIZE, vertex=np.zeros(0, int), progress=False) if part == "vertices" else transport
-    color = bright_texels.radiance(lit, GLOSSY, jnp.zeros(count, int), jnp.ones((count, 3)), eye=EYE)
+    color = shine(lit, GLOSSY, jnp.zeros(count, int), jnp.ones((count, 3)), eye=EYE)
     assert color.shape == (len(lit.position), 3)
     assert not np.asarray(color).any()
 
@@ -168,7 +171,7 @@ def test_none_have_no_radiance(mesh, transport, part):
 def test_none_may_be_taken(transport, sky):
     texel, excess, rest = bright_texels.split(sky, count=0)
     np.testing.assert_array_equal(rest.radiance, sky.radiance)
-    assert not np.asarray(bright_texels.radiance(transport, GLOSSY, texel, excess, eye=EYE)).any()
+    assert not np.asarray(shine(transport, GLOSSY, texel, excess, eye=EYE)).any()
 
 
 @pytest.mark.parametrize("count", [-1, ALL])
@@ -193,7 +196,7 @@ def test_excess_and_rest_light_as_the_light_did(transport, sky, close, colored):
     brdf = GLOSSY if colored in ("both", "brdf") else GRAY
     light = sky if colored in ("both", "light") else Environment(sky.radiance[..., :1])
     texel, excess, rest = bright_texels.split(light, count=COUNT)
-    bright = bright_texels.radiance(transport, brdf, texel, excess, eye=EYE)
+    bright = shine(transport, brdf, texel, excess, eye=EYE)
     assert bright.shape == (39, 1 if colored == "neither" else 3)
     close(bright, exact(transport, brdf, whole(texel, excess)))
     close(bright + exact(transport, brdf, rest), exact(transport, brdf, light))
@@ -207,7 +210,7 @@ def test_a_sun_in_one_texel_is_that_of_the_reference(mesh, transport, brdf):
     light = Environment(jnp.zeros((6, SIZE, SIZE, 3)).at[place].set(jnp.array([300.0, 200, 100])))
     found, excess, _ = bright_texels.split(light, count=COUNT)
     assert found[0] == texel
-    color = np.asarray(bright_texels.radiance(transport, brdf, found, excess, eye=EYE))
+    color = np.asarray(shine(transport, brdf, found, excess, eye=EYE))
     expected = np.asarray(reference.radiance(mesh, brdf, light, eye=EYE, error=np.inf))
     # Nine sixteenths are kept as eight; no vertex here sees that much of this texel.
     assert 0.5 not in np.asarray(transport.visible(jnp.array([texel])))
@@ -218,8 +221,8 @@ def test_a_sun_in_one_texel_is_that_of_the_reference(mesh, transport, brdf):
 def test_radiance_is_linear_in_the_excess(transport, sky, random, close):
     texel, excess, _ = bright_texels.split(sky, count=COUNT)
     other = jnp.asarray(random.normal(size=excess.shape), jnp.float32)
-    first, second = (bright_texels.radiance(transport, GLOSSY, texel, each, eye=EYE) for each in (excess, other))
-    close(bright_texels.radiance(transport, GLOSSY, texel, 2 * excess - other, eye=EYE), 2 * first - second)
+    first, second = (shine(transport, GLOSSY, texel, each, eye=EYE) for each in (excess, other))
+    close(shine(transport, GLOSSY, texel, 2 * excess - other, eye=EYE), 2 * first - second)
 
 
 def test_what_vertices_see_of_the_texels_may_be_looked_up_before_or_with_the_view(mesh, transport, sky, close):
@@ -229,16 +232,16 @@ def test_what_vertices_see_of_the_texels_may_be_looked_up_before_or_with_the_vie
     assert lit.seen is None
     assert system.shade(lit).seen.shape == (COUNT, len(transport.position))
     np.testing.assert_array_equal(system.combine(system.shade(lit), seen), system.combine(lit, seen))
-    close(system.combine(lit, seen), bright_texels.radiance(transport, GLOSSY, lit.texel, lit.excess, eye=EYE))
+    close(system.combine(lit, seen), shine(transport, GLOSSY, lit.texel, lit.excess, eye=EYE))
 
 
 def test_texels_in_any_order_and_twice_over_add_up(transport, sky, close):
     texel, excess, _ = bright_texels.split(sky, count=COUNT)
-    color = bright_texels.radiance(transport, GLOSSY, texel, excess, eye=EYE)
-    close(bright_texels.radiance(transport, GLOSSY, texel[::-1], excess[::-1], eye=EYE), color)
+    color = shine(transport, GLOSSY, texel, excess, eye=EYE)
+    close(shine(transport, GLOSSY, texel[::-1], excess[::-1], eye=EYE), color)
     same = jnp.full(COUNT, texel[0])
-    once = bright_texels.radiance(transport, GLOSSY, same, excess * jnp.eye(COUNT)[0][:, None], eye=EYE)
-    close(bright_texels.radiance(transport, GLOSSY, same, jnp.tile(excess[:1] / COUNT, (COUNT, 1)), eye=EYE), once)
+    once = shine(transport, GLOSSY, same, excess * jnp.eye(COUNT)[0][:, None], eye=EYE)
+    close(shine(transport, GLOSSY, same, jnp.tile(excess[:1] / COUNT, (COUNT, 1)), eye=EYE), once)
 
 
 @pytest.mark.parametrize("place", ["on a vertex", "far away", "in the plane"])

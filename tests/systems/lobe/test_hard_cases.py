@@ -224,7 +224,7 @@ def test_the_texel_apart_is_exact_also_where_light_and_view_are_one_direction(se
         eye = jnp.asarray(1e4 * center[place], jnp.float32)
         texel, excess, _ = bright_texels.split(light, count=1)
         for name in ("sharp", "rough", "power", "brushed"):
-            color = bright_texels.radiance(transport, BRDF[name], texel, excess, eye=eye)
+            color = jax.jit(bright_texels.radiance)(transport, BRDF[name], texel, excess, eye=eye)
             exact = reference.integrate(seen, transport.position, transport.frame, BRDF[name], light, eye, error=np.inf)
             assert np.isfinite(color).all()
             np.testing.assert_allclose(color, exact, rtol=1e-3, atol=1e-6)

@@ -36,11 +36,16 @@ def seen(visible):
     return visible.seen(np.arange(len(visible.position)))
 
 
+@jax.jit
+def look(transport, face, s, t, spread):
+    return transport.lobe_visibility(face, s, t, jnp.asarray(spread))
+
+
 def read(transport, direction, spread):
     """Shares of one lobe in the same world direction for all vertices."""
     count = len(transport.position)
-    face, s, t = cubemap.project(*(jnp.full((1, count), float(x)) for x in direction))
-    return transport.lobe_visibility(face, s, t, jnp.full((1, count), spread))
+    place = np.broadcast_to(np.float32(direction)[:, None, None], (3, 1, count))
+    return look(transport, *cubemap.project(*map(jnp.asarray, place)), np.full((1, count), spread, np.float32))
 
 
 def exact(seen, direction, spread):
@@ -115,15 +120,13 @@ def test_slopes_are_those_of_the_visible_parts(compressed):
     face = jnp.asarray(random.integers(6, size=(3, count)))
     s, t = (jnp.asarray(random.uniform(-0.9, 0.9, (3, count)), jnp.float32) for _ in range(2))
     spread = jnp.asarray(random.uniform(0.02, 0.04, (3, count)), jnp.float32)
-    _, by_s, by_t = compressed.lobe_visibility(face, s, t, spread)
-    along_s = (
-        compressed.lobe_visibility(face, s + step, t, spread)[0]
-        - compressed.lobe_visibility(face, s - step, t, spread)[0]
-    ) / (2 * step)
-    along_t = (
-        compressed.lobe_visibility(face, s, t + step, spread)[0]
-        - compressed.lobe_visibility(face, s, t - step, spread)[0]
-    ) / (2 * step)
+    _, by_s, by_t = look(compressed, face, s, t, spread)
+    along_s = (look(compressed, face, s + step, t, spread)[0] - look(compressed, face, s - step, t, spread)[0]) / (
+        2 * step
+    )
+    along_t = (look(compressed, face, s, t + step, spread)[0] - look(compressed, face, s, t - step, spread)[0]) / (
+        2 * step
+    )
     inside = (np.abs(s) < 0.4) & (np.abs(t) < 0.4)  # beyond, slopes blend over to the neighboring face
     for slope, difference in ((by_s, along_s), (by_t, along_t)):
         np.testing.assert_allclose(np.asarray(slope)[inside], np.asarray(difference)[inside], atol=5e-3)
@@ -132,8 +135,8 @@ def test_slopes_are_those_of_the_visible_parts(compressed):
 def test_slopes_are_what_differentiation_gives(compressed):
     face, s, t = cubemap.project(*(jnp.full((1, len(compressed.position)), x) for x in (0.3, 0.9, 0.2)))
     spread = jnp.full(s.shape, 0.03)
-    _, by_s, by_t = compressed.lobe_visibility(face, s, t, spread)
-    gradient = jax.grad(lambda s, t: jnp.sum(compressed.lobe_visibility(face, s, t, spread)[0]), argnums=(0, 1))(s, t)
+    _, by_s, by_t = look(compressed, face, s, t, spread)
+    gradient = jax.grad(lambda s, t: jnp.sum(look(compressed, face, s, t, spread)[0]), argnums=(0, 1))(s, t)
     np.testing.assert_allclose(gradient[0], by_s, atol=1e-5)
     np.testing.assert_allclose(gradient[1], by_t, atol=1e-5)
 

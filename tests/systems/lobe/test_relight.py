@@ -78,7 +78,7 @@ def all_texels(visible, brdf, light):
 def test_radiance_is_that_of_all_texels(name, visible, transport, tables, light, close):
     texel, excess, rest = bright_texels.split(light, count=8)
     color = relight(transport, tables[name], rest, eye=EYE)
-    color = color + bright_texels.radiance(transport, BRDFS[name], texel, excess, eye=EYE)
+    color = color + jax.jit(bright_texels.radiance)(transport, BRDFS[name], texel, excess, eye=EYE)
     seen = facing(visible)
     close(np.asarray(color)[seen], all_texels(visible, BRDFS[name], light)[seen], tolerance=COARSE[name])
 
