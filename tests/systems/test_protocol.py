@@ -1,6 +1,6 @@
 """What every system promises through its four methods, checked for all of them.
 
-To add a system, add a line to ``MADE``: it gets the scene's name and makes a system, with its materials, for that mesh.
+To add a system, add a line to ``SYSTEMS``: it gets a scene's name and makes a system, with its materials, for its mesh.
 """
 
 import functools
@@ -32,7 +32,7 @@ MEMBERS = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.4) for m in
 MODELS = {
     "white": Lambert(1.0),
     "glossy": GLOSSY,
-    **{f"metal {each}": MetallicRoughness(roughness=each) for each in (0.05, 0.3, 1.0)},  # white
+    **{f"metal {roughness}": MetallicRoughness(roughness=roughness) for roughness in (0.05, 0.3, 1.0)},  # white
     "channels": lambda wi, wo: jnp.concatenate([GLOSSY(wi, wo), 0.5 * GLOSSY(wi, wo), Lambert(1.0)(wi, wo)], -1),
 }
 
@@ -46,10 +46,10 @@ class Case(NamedTuple):
 
 
 class Promise(NamedTuple):
-    """How a system is made, and what it may err by.
+    """How to make a system, and its tolerances.
 
-    ``white`` is what it may be off in a white furnace, ``error`` under a light from the exact sum, both relative; None
-    where it has no such answer. ``linear`` systems add up lights exactly; those with bright texels choose which.
+    ``white``: relative, in a white furnace. ``error``: relative, against the exact sum. None skips the test. ``linear``
+    systems add up lights exactly; those with bright texels choose which texels are bright.
     """
 
     make: Callable[[str, str], tuple[prt.System, Any]]
@@ -213,7 +213,7 @@ def total(name: str, model: str) -> tuple[prt.System, Any]:
     return prt.total(lobes(name, model)[0], mattes(name, model)[0]), None
 
 
-MADE = {
+SYSTEMS = {
     "separable": Promise(sparse, 0.01, 0.1),
     "separable, clustered": Promise(clustered, 0.02, 0.1),
     "harmonic": Promise(matrices, 0.02, 0.25),
@@ -228,13 +228,13 @@ MADE = {
     "scene with bounces": Promise(between_parts, None, None),
     "lobe and matte": Promise(total, None, None),
 }
-each_system = pytest.mark.parametrize("name", MADE)
+each_system = pytest.mark.parametrize("name", SYSTEMS)
 
 
 @functools.cache
-def made(name: str, scene: str = "scene", model: str = "glossy") -> Case:
-    """A system, made once."""
-    return Case(*MADE[name].make(scene, model), mesh(scene))
+def case_of(name: str, scene: str = "scene", model: str = "glossy") -> Case:
+    """A system, its materials and its mesh, built once."""
+    return Case(*SYSTEMS[name].make(scene, model), mesh(scene))
 
 
 def light(seed: int = 0, *, lamps: int = 2) -> Environment:
@@ -245,7 +245,7 @@ def light(seed: int = 0, *, lamps: int = 2) -> Environment:
     return Environment(jnp.asarray(radiance, jnp.float32))
 
 
-def shown(case: Case, environment: Environment) -> np.ndarray:
+def color_of(case: Case, environment: Environment) -> np.ndarray:
     """Radiance of all vertices."""
     return np.asarray(prt.radiance(case.system, environment, eye=EYE, materials=case.materials))
 
@@ -258,12 +258,12 @@ def relit(system: prt.System, environment: Environment, materials: Any) -> jax.A
 
 @each_system
 def test_a_white_surface_in_a_white_furnace_is_white(name):
-    if MADE[name].white is None:
+    if SYSTEMS[name].white is None:
         pytest.skip("direct light alone fills a furnace")
-    case = made(name, "ball", "white")
+    case = case_of(name, "ball", "white")
     facing = np.sum(np.asarray(case.mesh.normal) * (np.asarray(EYE) - np.asarray(case.mesh.position)), 1) > 0.3
-    color = shown(case, Environment(jnp.ones((6, SIZE, SIZE, 3))))[facing]
-    np.testing.assert_allclose(np.sqrt(np.mean((color - 1) ** 2)), 0, atol=MADE[name].white)
+    color = color_of(case, Environment(jnp.ones((6, SIZE, SIZE, 3))))[facing]
+    np.testing.assert_allclose(np.sqrt(np.mean((color - 1) ** 2)), 0, atol=SYSTEMS[name].white)
 
 
 # Root mean square and largest error of white metals in a white furnace, by roughness, from all views. Lobes of .05 are
@@ -301,7 +301,7 @@ def reflected_fraction(model: Callable, height: np.ndarray) -> np.ndarray:
         normal = normal * [alpha, alpha, 1]
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         wi = 2 * (normal @ wo)[:, None] * normal - wo
-        shape = [np.sqrt(1 + alpha**2 * (1 / np.clip(each, 1e-6, 1) ** 2 - 1)) for each in (wi[:, 2], z)]
+        shape = [np.sqrt(1 + alpha**2 * (1 / np.clip(cosine, 1e-6, 1) ** 2 - 1)) for cosine in (wi[:, 2], z)]
         share = np.where(wi[:, 2] > 0, (1 + shape[1]) / (shape[0] + shape[1]), 0)  # G2 / G1, height-correlated
         result.append(np.mean(share))
     return np.array(result)
@@ -312,10 +312,10 @@ def reflected_fraction(model: Callable, height: np.ndarray) -> np.ndarray:
 def test_white_metals_in_a_white_furnace_send_what_single_scattering_reflects(name, roughness):
     if roughness not in METALS[name]:
         pytest.skip("its maps are coarser than the lobe; docs/limits.md says so")
-    case = made(name, "ball", f"metal {roughness}")
+    case = case_of(name, "ball", f"metal {roughness}")
     to = np.asarray(EYE) - np.asarray(case.mesh.position)
     height = np.sum(to / np.linalg.norm(to, axis=1, keepdims=True) * np.asarray(case.mesh.normal), 1)
-    color = shown(case, Environment(jnp.ones((6, SIZE, SIZE, 3))))[:, 0]
+    color = color_of(case, Environment(jnp.ones((6, SIZE, SIZE, 3))))[:, 0]
     seen = height > 0.05
     grid = np.linspace(0.05, 1, 24)
     expected = np.interp(height[seen], grid, reflected_fraction(MODELS[f"metal {roughness}"], grid))
@@ -327,9 +327,9 @@ def test_white_metals_in_a_white_furnace_send_what_single_scattering_reflects(na
 
 @each_system
 def test_radiance_is_that_of_the_exact_sum_vertex_by_vertex(name, close):
-    if MADE[name].error is None:
+    if SYSTEMS[name].error is None:
         pytest.skip("tests/systems/dynamic and bounces hold these to the exact sum of their own materials")
-    case, environment = made(name), light()
+    case, environment = case_of(name), light()
     exact = prt.reference.integrate(
         jnp.asarray(seen("scene").seen(np.arange(case.system.vertices))),
         seen("scene").position,
@@ -339,38 +339,38 @@ def test_radiance_is_that_of_the_exact_sum_vertex_by_vertex(name, close):
         EYE,
     )
     facing = np.sum(np.asarray(case.mesh.normal) * (np.asarray(EYE) - np.asarray(case.mesh.position)), 1) > 0.2
-    close(shown(case, environment)[facing], np.asarray(exact)[facing], tolerance=MADE[name].error)
+    close(color_of(case, environment)[facing], np.asarray(exact)[facing], tolerance=SYSTEMS[name].error)
 
 
 @each_system
 def test_radiance_is_linear_in_the_light(name, close):
-    case, first, second = made(name), light(1), light(2)
-    once = shown(case, first)
+    case, first, second = case_of(name), light(1), light(2)
+    once = color_of(case, first)
     for strength in (3.0, 1e-25, 1e25):
-        close(shown(case, Environment(first.radiance * np.float32(strength))) / strength, once, tolerance=1e-5)
-    if MADE[name].linear:
-        both = shown(case, Environment(first.radiance + second.radiance))
-        close(both, once + shown(case, second), tolerance=1e-5)
+        close(color_of(case, Environment(first.radiance * np.float32(strength))) / strength, once, tolerance=1e-5)
+    if SYSTEMS[name].linear:
+        both = color_of(case, Environment(first.radiance + second.radiance))
+        close(both, once + color_of(case, second), tolerance=1e-5)
 
 
 @each_system
 def test_no_light_makes_no_radiance(name):
-    assert not shown(made(name), Environment(jnp.zeros((6, SIZE, SIZE, 3)))).any()
+    assert not color_of(case_of(name), Environment(jnp.zeros((6, SIZE, SIZE, 3)))).any()
 
 
 @each_system
 def test_each_channel_of_the_light_reaches_only_itself(name, close):
-    case, whole = made(name), shown(made(name), light())
+    case, whole = case_of(name), color_of(case_of(name), light())
     for channel in range(3):
-        color = shown(case, Environment(light().radiance * (np.arange(3) == channel)))
+        color = color_of(case, Environment(light().radiance * (np.arange(3) == channel)))
         assert not np.delete(color, channel, axis=1).any()
-        if MADE[name].linear:
+        if SYSTEMS[name].linear:
             close(color[:, channel], whole[:, channel])
 
 
 @each_system
 def test_eyes_below_the_horizon_see_what_grazing_eyes_see(name, close):
-    case, of = made(name), made(name).mesh
+    case, of = case_of(name), case_of(name).mesh
     for vertex in (12, 31, 80):
         beside = np.asarray(of.position)[vertex] + np.asarray(of.tangent)[vertex]
         eyes = [jnp.asarray(beside + height * np.asarray(of.normal)[vertex]) for height in (-3, 0.005)]
@@ -383,12 +383,12 @@ def test_eyes_below_the_horizon_see_what_grazing_eyes_see(name, close):
 def test_vertices_that_see_nothing_are_black(name):
     if "bounces" in name:
         pytest.skip("tests/systems/bounces have a closed room")
-    assert not shown(made(name, "inside"), light()).any()
+    assert not color_of(case_of(name, "inside"), light()).any()
 
 
 @each_system
 def test_eyes_in_odd_places_give_finite_radiance_and_gradients(name):
-    case = made(name)
+    case = case_of(name)
     place = np.asarray(case.mesh.position)[7]
     beside = place * (1 + 1e-6)
     for eye in (place, beside, [0, 0, 0], [1e15, 1e15, -1e15], [50, -1.01, 3], [50, -1.01 + 1e-30, 3], [50, -7, 3]):
@@ -423,9 +423,9 @@ def random_weight(case: Case) -> np.ndarray:
 
 @each_system
 def test_stages_give_the_whole_inside_a_program_and_outside(name, close):
-    case = made(name)
+    case = case_of(name)
     system, materials, _ = case
-    whole = shown(case, light())
+    whole = color_of(case, light())
     arriving = system.shade(system.light(light()), materials)
     close(system.combine(arriving, system.view(EYE, materials)), whole)
     compiled, *_ = differentiated(system, light().radiance, EYE, materials, random_weight(case))
@@ -434,26 +434,26 @@ def test_stages_give_the_whole_inside_a_program_and_outside(name, close):
 
 @each_system
 def test_products_in_the_verbs_and_in_their_gradients_are_exact_on_gpus(name, loose):
-    case = made(name)
+    case = case_of(name)
     assert not loose(differentiated, case.system, light().radiance, EYE, case.materials, random_weight(case))
 
 
 @each_system
 def test_a_batch_of_lights_is_each_light_by_itself(name, close):
-    case = made(name)
+    case = case_of(name)
     batch = Environment(jnp.stack([light(seed).radiance for seed in (3, 4)])[None])
-    color = shown(case, batch)
+    color = color_of(case, batch)
     assert color.shape == (1, 2, case.system.vertices, 3)
-    close(color[0, 1], shown(case, light(4)))
+    close(color[0, 1], color_of(case, light(4)))
 
 
 @each_system
 def test_gradients_in_the_light_are_the_radiance_of_its_change(name, close):
-    if not MADE[name].linear:
+    if not SYSTEMS[name].linear:
         pytest.skip("which texels are bright is chosen; gradients in the turn of the light are for all systems")
-    case, weight, change = made(name), random_weight(made(name)), light(7)
+    case, weight, change = case_of(name), random_weight(case_of(name)), light(7)
     _, slope, _ = weighted(case, light(6), EYE, weight)
-    close(np.vdot(slope, change.radiance), np.vdot(weight, shown(case, change)), tolerance=1e-4)
+    close(np.vdot(slope, change.radiance), np.vdot(weight, color_of(case, change)), tolerance=1e-4)
 
 
 # Largest deviation of central differences from gradients for each step, over three directions together. Tables of eight
@@ -483,7 +483,7 @@ def hold_to_differences(value: Callable, slopes: list[float], directions: list, 
 
 @each_system
 def test_gradients_in_the_eye_are_differences_over_long_and_short_steps(name):
-    case, (environment, _) = made(name), soft(0.3)
+    case, (environment, _) = case_of(name), soft(0.3)
     to = OBLIQUE - np.asarray(case.mesh.position)
     facing = np.sum(np.asarray(case.mesh.normal) * to, 1) > 0.3 * np.linalg.norm(to, axis=1)
     weight = facing[:, None] / facing.sum()
@@ -497,7 +497,7 @@ def test_gradients_in_the_eye_are_differences_over_long_and_short_steps(name):
 
 @each_system
 def test_gradients_in_the_turn_of_the_light_are_differences_over_long_and_short_steps(name):
-    case, (environment, turn) = made(name), soft(0.3)
+    case, (environment, turn) = case_of(name), soft(0.3)
     # Of one side alone: all around, the radiance of a turned light hardly changes, and rounding would be measured.
     weight = np.maximum(np.asarray(case.mesh.normal) @ [0.8, 0.0, 0.6], 0)[:, None] / (3 * case.system.vertices)
     slope = np.vdot(weighted(case, environment, EYE, weight)[1], turn)
@@ -506,25 +506,25 @@ def test_gradients_in_the_turn_of_the_light_are_differences_over_long_and_short_
 
 @each_system
 def test_a_saved_system_relights_bit_for_bit(name, tmp_path):
-    case = made(name)
+    case = case_of(name)
     if name.endswith("bright texels"):
         assert isinstance(case.system.brdf, CookTorrance)
     prt.files.save(tmp_path / "system", case.system)
     loaded = prt.files.load(tmp_path / "system")
-    np.testing.assert_array_equal(shown(case._replace(system=loaded), light()), shown(case, light()))
+    np.testing.assert_array_equal(color_of(case._replace(system=loaded), light()), color_of(case, light()))
 
 
 @each_system
 def test_memory_counts_every_array_once(name):
-    system = made(name).system
-    arrays = {id(each): each.nbytes for each in jax.tree.leaves(system)}
+    system = case_of(name).system
+    arrays = {id(leaf): leaf.nbytes for leaf in jax.tree.leaves(system)}
     assert prt.memory(system) == sum(arrays.values()) > 0
 
 
 @each_system
 def test_a_mesh_of_one_triangle_is_lit(name):
-    case = made(name, "triangle")
-    color = shown(case, light())
+    case = case_of(name, "triangle")
+    color = color_of(case, light())
     assert color.shape == (3, 3)
     assert np.isfinite(color).all()
     assert color.any() == (not name.startswith("bounces"))
@@ -535,7 +535,7 @@ def test_a_mesh_of_one_triangle_is_lit(name):
 @each_system
 def test_sizes_at_which_a_compiler_was_wrong_agree_with_float64(name, count):
     # jaxlib 0.10.2 summed wrongly at these numbers of rows, with the optimization that users get.
-    system, materials, _ = made(name, str(count))
+    system, materials, _ = case_of(name, str(count))
     assert system.vertices == count
     single = relit(system, light(), materials)
     assert single.dtype == jnp.float32
@@ -567,29 +567,29 @@ def devices(count: int) -> list[jax.Device]:
 
 @each_system
 def test_a_system_laid_over_devices_has_the_same_radiance_and_gradients(name, close):
-    case = made(name, "triangle")
+    case = case_of(name, "triangle")
     system = prt.shard(case.system, devices(4))  # Three vertices, and a spare one where the system's arrays allow that.
     assert system.vertices == 3
     weight = random_weight(case)
     color, slope, _ = differentiated(system, light().radiance, EYE, case.materials, weight)
     assert len(color.sharding.device_set) == 4
-    close(color, shown(case, light()), tolerance=2e-5)
-    if MADE[name].linear:
+    close(color, color_of(case, light()), tolerance=2e-5)
+    if SYSTEMS[name].linear:
         atol = 1e-4 * np.abs(weight * color).sum()
         np.testing.assert_allclose(np.vdot(slope, light().radiance), np.vdot(weight, color), atol=atol)
 
 
 @pytest.mark.parametrize("name", ["separable", "lobe, bright texels"])
 def test_each_device_has_an_equal_share_of_the_vertices(name, close):
-    case = made(name, "triangle")
+    case = case_of(name, "triangle")
     even, spare = prt.shard(case.system, devices(3)), prt.shard(case.system, devices(4))
-    close(relit(even, light(), case.materials), shown(case, light()), tolerance=2e-5)
+    close(relit(even, light(), case.materials), color_of(case, light()), tolerance=2e-5)
     assert type(even) is type(case.system)
     for laid, count in ((even, 3), (spare.system, 4)):
         transport = laid.transport if name == "separable" else laid.visibility
         assert len(transport.position) == count
         array = transport.value if name == "separable" else transport.pyramid
-        shares = {each.device: each.data.shape for each in array.addressable_shards}
+        shares = {shard.device: shard.data.shape for shard in array.addressable_shards}
         assert len(shares) == count
         assert len(set(shares.values())) == 1
         assert sum(map(np.prod, shares.values())) == array.size
@@ -611,7 +611,7 @@ def test_materials_are_those_of_the_vertices_without_the_spare_ones(close):
 
 
 def test_a_transport_is_laid_over_devices_where_its_vertices_divide():
-    transport = made("separable", "triangle").system.transport
+    transport = case_of("separable", "triangle").system.transport
     laid = prt.shard(transport, devices(3))
     coefficient = jnp.asarray(np.random.default_rng(3).normal(size=(6 * SIZE**2, 3)), jnp.float32)
     np.testing.assert_allclose(laid.apply(coefficient), transport.apply(coefficient), rtol=1e-5, atol=1e-6)
@@ -621,7 +621,7 @@ def test_a_transport_is_laid_over_devices_where_its_vertices_divide():
 
 @pytest.mark.usefixtures("unchecked")
 def test_what_are_no_devices_and_what_has_no_vertices_are_refused():
-    system, here = made("lobe", "triangle").system, jax.devices()[0]
+    system, here = case_of("lobe", "triangle").system, jax.devices()[0]
     for wrong in ([], "cuda", ["cuda:0"], [here, here], 4, None):
         with pytest.raises(ValueError, match=r"devices must be one or more of \["):
             prt.shard(system, wrong)
@@ -632,30 +632,30 @@ def test_what_are_no_devices_and_what_has_no_vertices_are_refused():
 OF_REGIONS = dynamic.DynamicSystem | bounces.BouncesSystem | prt.RelitScene
 
 
-def placed(case: Case, triangle: np.ndarray, weight: np.ndarray) -> tuple[prt.System, np.ndarray]:
+def at_points(case: Case, triangle: np.ndarray, weight: np.ndarray) -> tuple[prt.System, np.ndarray]:
     """A system at points of some triangles, and their order there: systems of regions take one list for each."""
     face, region = np.asarray(case.mesh.face)[triangle], np.asarray(case.mesh.region)
     if not isinstance(case.system, OF_REGIONS):
         return case.system.at(on_triangles(case.mesh.face, triangle, weight)), np.arange(len(triangle))
     lists, order = [], []
     for number in range(region.max() + 1):
-        own = np.flatnonzero(region[face[:, 0]] == number)
+        inside = np.flatnonzero(region[face[:, 0]] == number)
         place = np.cumsum(region == number) - 1
-        lists.append(Points(jnp.asarray(place[face[own]].T), jnp.asarray(weight[own].T)))
-        order.append(own)
+        lists.append(Points(jnp.asarray(place[face[inside]].T), jnp.asarray(weight[inside].T)))
+        order.append(inside)
     return case.system.at(lists), np.concatenate(order)
 
 
 @each_system
 def test_radiance_at_the_corners_of_triangles_is_that_of_the_vertices(name, close):
-    case = made(name)
+    case = case_of(name)
     triangle = np.arange(len(case.mesh.face))
     for corner in (0, 2):
         weight = np.tile(np.eye(3, dtype=np.float32)[corner], (len(triangle), 1))
-        system, order = placed(case, triangle, weight)
-        color = shown(case._replace(system=system), light())
+        system, order = at_points(case, triangle, weight)
+        color = color_of(case._replace(system=system), light())
         assert system.vertices == len(color) == len(triangle)
-        close(color, shown(case, light())[np.asarray(case.mesh.face)[order, corner]], tolerance=2e-5)
+        close(color, color_of(case, light())[np.asarray(case.mesh.face)[order, corner]], tolerance=2e-5)
 
 
 def inside_triangles(case: Case) -> tuple[np.ndarray, np.ndarray]:
@@ -666,9 +666,9 @@ def inside_triangles(case: Case) -> tuple[np.ndarray, np.ndarray]:
 
 @each_system
 def test_radiance_at_points_is_the_exact_sum_there(name, close):
-    if MADE[name].error is None:
+    if SYSTEMS[name].error is None:
         pytest.skip("tests/systems/dynamic and bounces hold these to the exact sum of their own materials")
-    case = made(name)
+    case = case_of(name)
     triangle, weight = inside_triangles(case)
     points = on_triangles(case.mesh.face, triangle, weight)
     visible = seen("scene")
@@ -676,16 +676,16 @@ def test_radiance_at_points_is_the_exact_sum_there(name, close):
     position, frame = points.carry(visible.position), points.frame(visible.frame)
     exact = np.asarray(prt.reference.integrate(level.astype(np.uint8), position, frame, GLOSSY, light(), EYE))
     facing = np.sum(np.asarray(frame)[:, 2] * (np.asarray(EYE) - np.asarray(position)), 1) > 0.2
-    system, order = placed(case, triangle, weight)
-    color, facing, exact = shown(case._replace(system=system), light()), facing[order], exact[order]
+    system, order = at_points(case, triangle, weight)
+    color, facing, exact = color_of(case._replace(system=system), light()), facing[order], exact[order]
     # What arrives in the frames of three vertices is interpolated there: this mesh is coarse.
-    close(color[facing], exact[facing], tolerance=MADE[name].error + 0.05)
+    close(color[facing], exact[facing], tolerance=SYSTEMS[name].error + 0.05)
 
 
 @pytest.mark.parametrize("name", ["separable, clustered", "harmonic", "lobe, bright texels", "dynamic"])
 def test_points_go_through_programs_and_batches_and_have_gradients(name, close):
-    case = made(name)
-    system, _ = placed(case, *inside_triangles(case))
+    case = case_of(name)
+    system, _ = at_points(case, *inside_triangles(case))
 
     def seen(system, lit, eye):
         color = system.combine(lit, system.view(eye, case.materials))
@@ -695,14 +695,14 @@ def test_points_go_through_programs_and_batches_and_have_gradients(name, close):
     batch = jax.jit(jax.vmap(jax.grad(seen, argnums=2, has_aux=True), (None, None, 0)))
     slope, color = batch(system, lit, eyes)
     assert np.isfinite(slope).all()
-    close(color[0], shown(case._replace(system=system), light()), tolerance=2e-5)
+    close(color[0], color_of(case._replace(system=system), light()), tolerance=2e-5)
 
 
 @each_system
 @pytest.mark.usefixtures("unchecked")
 def test_what_are_no_points_are_refused(name):
     with pytest.raises(TypeError, match="points must be"):
-        made(name).system.at(np.zeros(3))
+        case_of(name).system.at(np.zeros(3))
 
 
 OUTSIDE = [
@@ -717,7 +717,7 @@ OUTSIDE = [
 @each_system
 @pytest.mark.usefixtures("unchecked")
 def test_points_outside_of_triangles_are_refused(name):
-    system = made(name).system
+    system = case_of(name).system
     for corner, weight, message in OUTSIDE:
         wrong = Points(jnp.asarray(corner), jnp.asarray(weight))
         with pytest.raises(ValueError, match=message):
@@ -727,7 +727,7 @@ def test_points_outside_of_triangles_are_refused(name):
 @each_system
 @pytest.mark.usefixtures("unchecked")
 def test_what_is_of_another_kind_is_refused_by_what_makes_it(name):
-    system, materials, _ = made(name)
+    system, materials, _ = case_of(name)
     with pytest.raises(TypeError, match=r"light must be .*Environment, which jaxprt.scene.load_environment makes"):
         prt.radiance(system, light().radiance, eye=EYE, materials=materials)
     with pytest.raises((TypeError, ValueError), match="eye must be"):
@@ -744,17 +744,17 @@ def test_lights_of_another_size_are_refused(name):
     if "harmonic" in name or name.startswith("bounces"):
         pytest.skip("takes lights of any size that it can reduce")
     with pytest.raises(ValueError, match=r"light('s faces)? must .*\b8\b.* got .*\b16\b"):
-        made(name).system.light(Environment(jnp.ones((6, 16, 16, 3))))
+        case_of(name).system.light(Environment(jnp.ones((6, 16, 16, 3))))
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_only_systems_are_relit():
     with pytest.raises(TypeError, match=r"system must be one of jaxprt, such as .*, got SparseTransport"):
-        prt.radiance(made("separable").system.transport, light(), eye=EYE)
+        prt.radiance(case_of("separable").system.transport, light(), eye=EYE)
     with pytest.raises(ValueError, match=r"the same number of vertices, got \[3, 101\]"):
-        prt.total(made("lobe", "triangle").system, made("lobe").system)
+        prt.total(case_of("lobe", "triangle").system, case_of("lobe").system)
     with pytest.raises(ValueError, match="at least one"):
-        prt.radiance(made("lobe").system, Environment(jnp.ones((0, 6, SIZE, SIZE, 3))), eye=EYE)
+        prt.radiance(case_of("lobe").system, Environment(jnp.ones((0, 6, SIZE, SIZE, 3))), eye=EYE)
 
 
 def random_blend(system: prt.System) -> prt.Blend:
@@ -768,7 +768,7 @@ BLENDED = ["separable", "harmonic", "lobe", "lobe, bright texels"]
 @pytest.mark.parametrize("name", BLENDED)
 @pytest.mark.usefixtures("unchecked")
 def test_a_blend_weights_the_channels_of_each_vertex(name, close):
-    system, _ = MADE[name].make("scene", "channels")
+    system, _ = SYSTEMS[name].make("scene", "channels")
     weight = np.asarray(random_blend(system).weight)
     mixed = prt.radiance(system, light(), eye=EYE, materials=prt.Blend(weight))
     channel = np.arange(3)[:, None]
@@ -786,7 +786,7 @@ def test_a_blend_chooses_the_parameter_of_each_vertex(name, close):
     def rough(m):
         return CookTorrance(diffuse=0.5, specular=0.5, roughness=jnp.exp(m), f0=0.4)
 
-    transport = made(name).system.transport
+    transport = case_of(name).system.transport
     if name == "lobe":
         table = lobe.tabulate(rough, lobes=4, resolution=8, knot=knot)
         system, fixed = lobe.LobeSystem(transport, table), lobe.LobeSystem(transport, table.at(jnp.asarray(-0.7)))
@@ -797,8 +797,8 @@ def test_a_blend_chooses_the_parameter_of_each_vertex(name, close):
     ones = jnp.ones((count, 1, 1))
     value = np.where(np.arange(count) % 2, -0.7, np.log(0.6)).astype(np.float32)
     color, same = (
-        prt.radiance(system, light(), eye=EYE, materials=prt.Blend(ones, (jnp.asarray(each),)))
-        for each in (value, np.full(count, -0.7, np.float32))
+        prt.radiance(system, light(), eye=EYE, materials=prt.Blend(ones, (jnp.asarray(parameter),)))
+        for parameter in (value, np.full(count, -0.7, np.float32))
     )
     close(np.asarray(color)[1::2], np.asarray(same)[1::2])
     assert np.abs(np.asarray(color)[::2] - np.asarray(same)[::2]).max() > 1e-3
@@ -812,10 +812,10 @@ def test_a_blend_chooses_the_parameter_of_each_vertex(name, close):
 
 
 def test_systems_of_equal_lights_say_so():
-    first, second = made("lobe").system, made("lobe", "ball").system
+    first, second = case_of("lobe").system, case_of("lobe", "ball").system
     assert first.shared_light == second.shared_light is not None
-    assert made("separable").system.shared_light is None
-    assert made("lobe, bright texels").system.shared_light != first.shared_light
+    assert case_of("separable").system.shared_light is None
+    assert case_of("lobe, bright texels").system.shared_light != first.shared_light
     assert protocol.System.shared_light.fget(first) is None
 
 
@@ -825,15 +825,15 @@ HALF = ("float16", "bfloat16")
 @each_system
 @pytest.mark.usefixtures("unchecked")
 def test_lights_and_eyes_of_every_float_type_give_one_radiance(name, close):
-    system, materials, _ = made(name)
+    system, materials, _ = case_of(name)
     radiance = partial(prt.radiance, system, materials=materials)
     bright = light().radiance
     exact = radiance(Environment(bright), eye=EYE)
     for dtype in (*HALF, "float64", "int32"):
-        given = np.asarray(bright).astype(jnp.dtype(dtype))
-        expected = radiance(Environment(jnp.asarray(given, jnp.float32)), eye=EYE)
+        rounded = np.asarray(bright).astype(jnp.dtype(dtype))
+        expected = radiance(Environment(jnp.asarray(rounded, jnp.float32)), eye=EYE)
         kind = jnp.dtype(dtype if dtype in HALF else "float64")
-        color = radiance(Environment(given), eye=np.asarray(EYE).astype(kind))
+        color = radiance(Environment(rounded), eye=np.asarray(EYE).astype(kind))
         assert color.dtype == exact.dtype
         close(color, expected, tolerance=1e-5)  # EYE is exact in half precision
     with jax.numpy_dtype_promotion("strict"):
@@ -845,7 +845,7 @@ def test_lights_and_eyes_of_every_float_type_give_one_radiance(name, close):
 
 @each_system
 def test_gradients_come_back_in_the_type_of_the_light_and_the_eye(name):
-    case = made(name)
+    case = case_of(name)
     arguments = jax.ShapeDtypeStruct(light().radiance.shape, jnp.bfloat16), jax.ShapeDtypeStruct((3,), jnp.float16)
     _, *slope = jax.eval_shape(differentiated, case.system, *arguments, case.materials, random_weight(case))
     assert [part.dtype for part in slope] == [argument.dtype for argument in arguments]
@@ -867,7 +867,7 @@ def test_a_light_of_float32_is_taken_where_float64_is_enabled(close):
 @each_system
 @pytest.mark.usefixtures("unchecked")
 def test_the_largest_and_smallest_lights_make_no_nan_and_larger_ones_are_refused(name):
-    system, materials, _ = made(name)
+    system, materials, _ = case_of(name)
     radiance = partial(prt.radiance, system, eye=EYE, materials=materials)
     for scale in (1e32 / 6.0, 1e-20, 1e-38):
         assert np.isfinite(radiance(Environment(light().radiance * scale))).all()
@@ -879,7 +879,7 @@ def test_the_largest_and_smallest_lights_make_no_nan_and_larger_ones_are_refused
 @pytest.mark.parametrize("name", BLENDED)
 @pytest.mark.usefixtures("unchecked")
 def test_lights_of_two_or_four_colors_are_refused_by_number_where_the_materials_have_three(name):
-    system, _ = MADE[name].make("triangle", "channels")
+    system, _ = SYSTEMS[name].make("triangle", "channels")
     view = system.view(EYE, prt.Blend(jnp.ones((3, 3, 3))))
     for colors in (2, 4):
         lit = system.shade(system.light(Environment(jnp.ones((6, SIZE, SIZE, colors)))))
@@ -890,8 +890,8 @@ def test_lights_of_two_or_four_colors_are_refused_by_number_where_the_materials_
 # The last test here: it forgets all programs, twice.
 @pytest.mark.parametrize("name", ["separable", "dynamic", "bounces"])  # They have all loops among them.
 def test_what_gpus_run_gives_the_same_radiance(name, request, close):
-    case = made(name, "triangle")
-    expected = shown(case, light())
+    case = case_of(name, "triangle")
+    expected = color_of(case, light())
     request.getfixturevalue("elsewhere")
     close(relit(case.system, light(), case.materials), expected, tolerance=2e-5)
     text = relit.trace(case.system, light(), case.materials).lower(lowering_platforms=("cuda",)).as_text()
