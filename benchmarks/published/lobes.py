@@ -42,7 +42,7 @@ def mirror_lobes(brdf: Callable, *, angles: tuple[int | float, ...] = (0, 7, 14,
     """
     if not angles or min(angles) < 0:
         raise ValueError(f"angles must be at least one, none below 0, got {angles}")
-    wo, (sample, mass, _, extent) = lobe_table.sampled(brdf, resolution=resolution)
+    wo, (sample, mass, _, extent) = lobe_table.brdf_samples(brdf, resolution=resolution)
     width = np.radians(np.asarray(angles, np.float64)) / 3
     concentration = (1 / np.maximum(width**2, 1 / em.FINEST)).astype(wo.dtype)
     mean, scale, weight, diffuse = _mirror_lobes(wo, sample, mass, extent, concentration)

@@ -102,7 +102,7 @@ def _reflect(brdf, wi: Array, wo: Array, arc: Callable, plane: Callable) -> Arra
     return jnp.where(lit[..., None], value / brdf.distance, 0)
 
 
-def _mirrored(theta: Array, low: Array, high: Array, period: Array | float = 0) -> tuple[Array, Array]:
+def _mirror(theta: Array, low: Array, high: Array, period: Array | float = 0) -> tuple[Array, Array]:
     """Limits that hold for directions from the right, mirrored for directions from the left."""
     right = theta >= 0
     return jnp.where(right, low, period - high), jnp.where(right, high, period - low)
@@ -144,7 +144,7 @@ class PoulinFournier(Model):
         edge, turn = self._edge(), jnp.abs(theta)
         reach = jnp.arcsin(_inside(self.distance * jnp.cos(theta) - 1))
         reach = jnp.where(jnp.pi / 2 - turn < edge, reach, jnp.pi / 2)
-        return _mirrored(theta, jnp.maximum(turn - jnp.pi / 2, -edge), jnp.minimum(turn + reach, edge))
+        return _mirror(theta, jnp.maximum(turn - jnp.pi / 2, -edge), jnp.minimum(turn + reach, edge))
 
     def _plane(self, theta: Array) -> tuple[Array, Array]:
         # The ray passes the silhouettes of the left and right cylinders, or their feet if the silhouettes are buried.
@@ -152,7 +152,7 @@ class PoulinFournier(Model):
         sine, cosine = jnp.sin(turn), jnp.cos(turn)
         left = jnp.where(edge > jnp.pi / 2 + turn, (1 - self.height * sine) / cosine, jnp.sin(edge))
         right = jnp.where(edge > jnp.pi / 2 - turn, (1 + self.height * sine) / cosine, jnp.sin(edge))
-        return _mirrored(theta, left, self.distance - right, self.distance)
+        return _mirror(theta, left, self.distance - right, self.distance)
 
 
 class PoulinFournierGrooves(Model):
@@ -187,7 +187,7 @@ class PoulinFournierGrooves(Model):
         # Normals right of the axis point left. Seen from the right, the right rim hides the part of the arc between
         # itself and the point where the ray through the rim meets the arc again.
         edge, turn = jnp.broadcast_to(self._edge(), theta.shape), jnp.abs(theta)
-        return _mirrored(theta, jnp.maximum(edge + 2 * turn - jnp.pi, -edge), edge)
+        return _mirror(theta, jnp.maximum(edge + 2 * turn - jnp.pi, -edge), edge)
 
     def _plane(self, theta: Array) -> tuple[Array, Array]:
         foot = jnp.broadcast_to(jnp.sin(self._edge()), theta.shape)

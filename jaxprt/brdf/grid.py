@@ -60,7 +60,7 @@ def check_family(brdf: Any, knot: Any) -> None:
         raise TypeError(f"the BRDF must be a function of the parameters, with knots, got {require.shown(brdf)}")
 
 
-def checked(knot: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
+def check_knots(knot: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
     """The knots of each parameter, converted to float64.
 
     Raises:
@@ -71,13 +71,13 @@ def checked(knot: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
         require.real(f"knots of parameter {number}", values)
     if len(knot) > 2:
         raise ValueError(f"at most two parameters can be tabulated, got {len(knot)}")
-    every = tuple(np.asarray(values, np.float64) for values in knot)
-    for number, values in enumerate(every):
+    knots = tuple(np.asarray(values, np.float64) for values in knot)
+    for number, values in enumerate(knots):
         if values.ndim != 1 or len(values) < 2 or not np.all(np.isfinite(values)) or not np.all(np.diff(values) > 0):
             raise ValueError(
                 f"knots of parameter {number} must be at least two finite increasing numbers, got {values}"
             )
-    return every
+    return knots
 
 
 def place(knot: Float[Array, " k"], parameter: Float[Array, "*v"]) -> Float[Array, "*v"]:

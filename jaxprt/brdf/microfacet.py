@@ -206,7 +206,7 @@ class MetallicRoughness(Model):
             require.real(f"{name} of MetallicRoughness", value)
         for name in ("metallic", "specular", "anisotropy"):
             require.within(f"{name} of MetallicRoughness", getattr(self, name), 0, 1)
-        shape = {name: each.shape for name, each in vars(self).items()}
+        shape = {name: value.shape for name, value in vars(self).items()}
         for name in ("base_color", "specular_color"):
             if shape[name][-1] not in (1, 3):
                 raise ValueError(f"{name} of MetallicRoughness must have 1 or 3 channels, got shape {shape[name]}")
@@ -214,7 +214,7 @@ class MetallicRoughness(Model):
         try:
             np.broadcast_shapes(*shape.values())
         except ValueError as error:
-            leading = ", ".join(f"{name} {each}" for name, each in shape.items() if each)
+            leading = ", ".join(f"{name} {sizes}" for name, sizes in shape.items() if sizes)
             raise ValueError(f"leading axes of MetallicRoughness must broadcast, got {leading}") from error
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
@@ -253,7 +253,7 @@ class MetallicRoughness(Model):
 
     def coefficient(self) -> Float[Array, "*b 4 c"]:
         """Weights of the four `terms`. They are not negative for colors up to 1."""
-        return _stacked(self)
+        return _stack(self)
 
     def needed(self) -> tuple[int, ...]:
         """Indices of the `terms` whose weight is not zero everywhere; all four while JAX traces the values.
@@ -264,8 +264,8 @@ class MetallicRoughness(Model):
             term = [material.terms()[k] for k in keep]
             weight = material.coefficient()[..., keep, :]
         """
-        each = enumerate(_separate(self))
-        return tuple(k for k, weight in each if isinstance(weight, Tracer) or np.any(np.asarray(weight)))
+        weights = enumerate(_separate(self))
+        return tuple(k for k, weight in weights if isinstance(weight, Tracer) or np.any(np.asarray(weight)))
 
     def _alphas(self) -> tuple[Array, Array]:
         """Alpha along the axis of anisotropy and across it."""
@@ -290,5 +290,5 @@ def _separate(material: MetallicRoughness) -> tuple[Array, ...]:
 
 
 @jit
-def _stacked(material: MetallicRoughness) -> Array:
+def _stack(material: MetallicRoughness) -> Array:
     return jnp.stack(jnp.broadcast_arrays(*material._coefficients()), -2)

@@ -47,7 +47,7 @@ class Line(eqx.Module):
             ValueError: The coordinate is not a single number.
         """
         knot = self.chart(self.knot)
-        low, upper = _neighbors(knot, self.chart(_checked(coordinate, ())), len(knot))
+        low, upper = _neighbors(knot, self.chart(_check_coordinate(coordinate, ())), len(knot))
         return jnp.zeros(len(knot), upper.dtype).at[low].set(1 - upper).at[low + 1].set(upper)
 
     @property
@@ -88,7 +88,7 @@ class Plane(eqx.Module):
         Raises:
             ValueError: There are not two coordinates.
         """
-        return _weight(self, _checked(coordinate, (2,)))
+        return _weight(self, _check_coordinate(coordinate, (2,)))
 
     @property
     def pairs(self) -> Int[np.ndarray, "p 2"]:
@@ -97,7 +97,7 @@ class Plane(eqx.Module):
 
     def inside(self, coordinate: Float[Array, "2"]) -> Bool[Array, ""]:
         """Whether the coordinate is inside of the boundary or on it, up to rounding."""
-        point, spot = (_scaled(self.chart, self.point, each) for each in (self.point, coordinate))
+        point, spot = (_scale(self.chart, self.point, spot) for spot in (self.point, coordinate))
         return _within(point[self.edge], spot)
 
 
@@ -132,20 +132,20 @@ class Columns(eqx.Module):
         Raises:
             ValueError: There are not two coordinates.
         """
-        return _column_weight(self, _checked(coordinate, (2,)))
+        return _column_weight(self, _check_coordinate(coordinate, (2,)))
 
     @property
     def pairs(self) -> Int[np.ndarray, "p 2"]:
         """The pairs of BRDFs that some place has weights for, the lower number first."""
         height = np.asarray(self.chart(self.point), np.float64)[:, 1]
-        column = [each[:count] for each, count in zip(np.asarray(self.order), np.asarray(self.count), strict=True)]
-        found = []
+        column = [rows[:count] for rows, count in zip(np.asarray(self.order), np.asarray(self.count), strict=True)]
+        corners = []
         for sides in itertools.pairwise(column):
             knot = np.unique(height[np.concatenate(sides)])
             middle = (knot[1:] + knot[:-1]) / 2
-            low = [np.clip(np.searchsorted(height[each], middle) - 1, 0, len(each) - 2) for each in sides]
-            found.append(np.stack([each[n + up] for each, n in zip(sides, low, strict=True) for up in (0, 1)], -1))
-        return _pairs(np.concatenate(found))
+            low = [np.clip(np.searchsorted(height[rows], middle) - 1, 0, len(rows) - 2) for rows in sides]
+            corners.append(np.stack([rows[n + up] for rows, n in zip(sides, low, strict=True) for up in (0, 1)], -1))
+        return _pairs(np.concatenate(corners))
 
     def inside(self, coordinate: Float[Array, "2"]) -> Bool[Array, ""]:
         """Whether both coordinates are between their ends, inclusive."""
@@ -183,7 +183,7 @@ def triangulate(
         raise ValueError(f"points must not all lie on one line, got {len(point)} that do")
     side = np.concatenate([triangle[:, [0, 1]], triangle[:, [1, 2]], triangle[:, [2, 0]]])
     outer = ~np.isin(side @ [len(point), 1], side @ [1, len(point)])
-    triangle, side = (jax.device_put(each.astype(np.int32)) for each in (triangle, side[outer]))
+    triangle, side = (jax.device_put(index.astype(np.int32)) for index in (triangle, side[outer]))
     return Plane(jax.device_put(point), triangle, side, chart)
 
 
@@ -197,11 +197,11 @@ def in_columns(point: Float[ArrayLike, "m 2"], *, chart: Callable[[Array], Array
     point = np.asarray(point).astype(jnp.result_type(float))
     if point.ndim != 2 or point.shape[1] != 2 or len(point) < 4 or not np.isfinite(point).all():
         return False
-    scaled = np.asarray(_scaled(chart, point, point), np.float64)
+    scaled = np.asarray(_scale(chart, point, point), np.float64)
     rounding = float(_ROUNDING * np.finfo(point.dtype).eps)
-    found = _split(scaled, rounding)
-    ends = [(min(scaled[each, 1]), max(scaled[each, 1])) for each in found]
-    return len(found) > 1 and all(low <= rounding and high >= 1 - rounding for low, high in ends)
+    groups = _split(scaled, rounding)
+    ends = [(min(scaled[group, 1]), max(scaled[group, 1])) for group in groups]
+    return len(groups) > 1 and all(low <= rounding and high >= 1 - rounding for low, high in ends)
 
 
 def columns(
@@ -229,25 +229,25 @@ def columns(
             "columns have the same smallest and largest second coordinate; "
             f"got {len(point)} points with {count} different first coordinates"
         )
-    found = _split(scaled, rounding)
-    most = max(map(len, found))
-    order = np.stack([np.pad(each, (0, most - len(each)), mode="edge") for each in found])
-    order, count = (jax.device_put(np.asarray(each, np.int32)) for each in (order, [len(each) for each in found]))
+    groups = _split(scaled, rounding)
+    most = max(map(len, groups))
+    order = np.stack([np.pad(group, (0, most - len(group)), mode="edge") for group in groups])
+    order, count = (jax.device_put(np.asarray(group, np.int32)) for group in (order, [len(group) for group in groups]))
     return Columns(jax.device_put(point), order, count, chart)
 
 
 def _pairs(group: Int[np.ndarray, "g n"]) -> Int[np.ndarray, "p 2"]:
     """All pairs of indices within groups, each once."""
     first, second = np.triu_indices(group.shape[1], 1)
-    each = np.sort(np.stack([group[:, first], group[:, second]], -1).reshape(-1, 2), -1)
-    return np.unique(each, axis=0)
+    pair = np.sort(np.stack([group[:, first], group[:, second]], -1).reshape(-1, 2), -1)
+    return np.unique(pair, axis=0)
 
 
 def _split(scaled: np.ndarray, rounding: float) -> list[np.ndarray]:
     """Point indices of each column, sorted by the second coordinate."""
     along = np.argsort(scaled[:, 0], kind="stable")
     parts = np.split(along, np.flatnonzero(np.diff(scaled[along, 0]) > rounding) + 1)
-    return [each[np.argsort(scaled[each, 1], kind="stable")] for each in parts]
+    return [part[np.argsort(scaled[part, 1], kind="stable")] for part in parts]
 
 
 def _apart(
@@ -263,7 +263,7 @@ def _apart(
         first = f"the first is {name[broken[0]]} at {_text(point[broken[0]])}"
         raise ValueError(f"points must be finite, got {broken.size} that are not, {first}")
     # Computed in the same precision as `Plane` does.
-    scaled = np.asarray(_scaled(chart, point, point), np.float64)
+    scaled = np.asarray(_scale(chart, point, point), np.float64)
     rounding = float(_ROUNDING * np.finfo(point.dtype).eps)
     distance, pair = scipy.spatial.KDTree(scaled).query(scaled, k=2)
     i, j = sorted(np.asarray(pair)[np.argmin(distance[:, 1])])
@@ -281,7 +281,7 @@ def _text(point: np.ndarray) -> str:
 @jit
 def _column_weight(columns: Columns, coordinate: Array) -> Array:
     """`Columns.weight` for two finite numbers."""
-    point, spot = (columns.chart(each) for each in (columns.point, coordinate))
+    point, spot = (columns.chart(spot) for spot in (columns.point, coordinate))
     place = point[columns.order]
     left, across = _neighbors(place[:, 0, 0], spot[0], len(place))
     result = jnp.zeros(len(point), across.dtype)
@@ -302,7 +302,7 @@ def _neighbors(knot: Array, spot: Array, count: ArrayLike) -> tuple[Array, Array
 @jit
 def _weight(plane: Plane, coordinate: Array) -> Array:
     """`Plane.weight` for two finite numbers: some sixty operations, compiled as one program."""
-    point, spot = (_scaled(plane.chart, plane.point, each) for each in (plane.point, coordinate))
+    point, spot = (_scale(plane.chart, plane.point, spot) for spot in (plane.point, coordinate))
     # The selection of a triangle or edge is not differentiated.
     still, fixed = jax.lax.stop_gradient((point, spot))
     weight, flat = _barycentric(still[plane.triangle], fixed)
@@ -321,7 +321,7 @@ def _weight(plane: Plane, coordinate: Array) -> Array:
     return jnp.zeros(len(point), weight.dtype).at[index].add(weight)
 
 
-def _checked(coordinate: ArrayLike, shape: tuple[int, ...]) -> Array:
+def _check_coordinate(coordinate: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Coordinates as floating-point numbers. Infinite ones become large finite ones."""
     value = jnp.asarray(coordinate, jnp.result_type(float))
     if value.shape != shape:
@@ -336,7 +336,7 @@ def _clip(value: Array, low: ArrayLike, high: ArrayLike) -> Array:
 
 
 @functools.partial(jit, static_argnums=0)
-def _scaled(chart: Callable[[Array], Array], point: Array, coordinate: Array) -> Array:
+def _scale(chart: Callable[[Array], Array], point: Array, coordinate: Array) -> Array:
     """Coordinates in the chart, scaled so that those of the points range from 0 to 1."""
     low, high = jnp.min(chart(point), 0), jnp.max(chart(point), 0)
     return (chart(coordinate) - low) / jnp.where(high > low, high - low, 1)

@@ -24,10 +24,10 @@ class PerVertex(eqx.Module):
     def __check_init__(self):
         """Refuses parameters with different numbers of vertices."""
         leaves = jax.tree.leaves(self.model)
-        if not leaves or any(not each.ndim for each in leaves):
+        if not leaves or any(not leaf.ndim for leaf in leaves):
             raise ValueError("every parameter of the model must have a leading axis of vertices, got one without")
-        for each in leaves:
-            require.length("rows of each parameter of the model", each, len(leaves[0]))
+        for leaf in leaves:
+            require.length("rows of each parameter of the model", leaf, len(leaves[0]))
 
     @property
     def vertices(self) -> int:
@@ -45,7 +45,7 @@ class PerVertex(eqx.Module):
 
 @jit
 def _rows(model: Callable, vertex: Array) -> Callable:
-    return jax.tree.map(lambda each: each[vertex], model)
+    return jax.tree.map(lambda leaf: leaf[vertex], model)
 
 
 class Channels(eqx.Module):
@@ -62,4 +62,4 @@ class Channels(eqx.Module):
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b k"]:
         """Values in 1/sr, times the scales."""
-        return jnp.concatenate([each(wi, wo) for each in self.model], -1) * self.scale
+        return jnp.concatenate([model(wi, wo) for model in self.model], -1) * self.scale

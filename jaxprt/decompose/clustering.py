@@ -37,7 +37,7 @@ def bisect(point: Float[np.ndarray, "v f"], *, clusters: int) -> Int[np.ndarray,
         offset = point[member] - point[member].mean(0)
         value, axis = np.linalg.eigh(offset.T @ offset)
         axis = axis[:, ::-1] @ eigen.orientation(value[::-1], axis[:, ::-1])
-        order = member[_ordered(offset @ axis[:, 0])]
+        order = member[_order(offset @ axis[:, 0])]
         # Each side gets points for a whole number of clusters, so that final sizes differ by at most one.
         first = parts // 2
         cut = len(member) // parts * first + min(len(member) % parts, first)
@@ -45,7 +45,7 @@ def bisect(point: Float[np.ndarray, "v f"], *, clusters: int) -> Int[np.ndarray,
     return np.stack(done)
 
 
-def _ordered(along: Float[np.ndarray, " v"]) -> Int[np.ndarray, " v"]:
+def _order(along: Float[np.ndarray, " v"]) -> Int[np.ndarray, " v"]:
     """Indices of points in ascending order. Points with equal coordinates are ordered by index.
 
     Symmetric meshes have many equal coordinates. Their order must not depend on rounding, which differs between

@@ -34,19 +34,19 @@ def _iterate(apply: Callable, size: int, terms: int, steps: int, dtype) -> tuple
         basis, image, fresh = carry
         place, noise = item
         # Random vectors replace products that add nothing to the span. Projecting twice is then enough.
-        fresh = _normalized(fresh) + 10 * jnp.finfo(dtype).eps * _normalized(noise)
+        fresh = _normalize(fresh) + 10 * jnp.finfo(dtype).eps * _normalize(noise)
         for _ in range(2):
             fresh = _orthonormal(fresh - basis @ (basis.T @ fresh))
         product = apply(fresh)
         basis, image = (
-            jax.lax.dynamic_update_slice(every, each, (0, place)) for every, each in ((basis, fresh), (image, product))
+            jax.lax.dynamic_update_slice(whole, part, (0, place)) for whole, part in ((basis, fresh), (image, product))
         )
         return (basis, image, product), None
 
     def step(carry, sweep):
         fresh = _orthonormal(carry[0])
         product = apply(fresh)
-        basis, image = (jnp.pad(each, ((0, 0), (0, (depth - 1) * block))) for each in (fresh, product))
+        basis, image = (jnp.pad(array, ((0, 0), (0, (depth - 1) * block))) for array in (fresh, product))
         # Other random vectors in each sweep, because the span already contains those of the last sweep.
         items = block * jnp.arange(1, depth), jnp.roll(draw[1:], sweep, 1)
         (basis, image, _), _ = jax.lax.scan(grow, (basis, image, product), items)
@@ -69,7 +69,7 @@ def _orthonormal(vector: Array) -> Array:
     return jnp.linalg.qr(vector)[0]
 
 
-def _normalized(vector: Array) -> Array:
+def _normalize(vector: Array) -> Array:
     length = jnp.linalg.norm(vector, axis=0)
     return vector / jnp.where(length > 0, length, 1)
 

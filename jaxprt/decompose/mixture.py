@@ -100,8 +100,8 @@ def bands(concentration: Float[Array, "*b"], *, degree: int) -> Float[Array, "l 
     ratio, factor = [jnp.zeros_like(safe)], [jnp.ones_like(safe)]
     for l in range(degree + _BESSEL, 0, -1):
         ratio.append(1 / ((2 * l + 1) / safe + ratio[-1]))
-    for each in ratio[::-1][:degree]:
-        factor.append(factor[-1] * each)
+    for step in ratio[::-1][:degree]:
+        factor.append(factor[-1] * step)
     return jnp.stack([jnp.where(sharp, a, b) for a, b in zip(known, factor, strict=False)])
 
 
@@ -174,32 +174,32 @@ def fit(
     scale = jnp.where(total > 0, total, 1)
     mass = mass / scale
     count = len(start.weight)
-    every = jnp.concatenate([start.weight, weight])
-    every = every / jnp.where(jnp.sum(every) > 0, jnp.sum(every), 1)
+    share = jnp.concatenate([start.weight, weight])
+    share = share / jnp.where(jnp.sum(share) > 0, jnp.sum(share), 1)
 
-    def expect(every, mean, concentration):
+    def expect(share, mean, concentration):
         lobe = log_density(sample, mean, concentration) - extent[:, None] * concentration
-        return _expect(jnp.concatenate([lobe, fixed], 1), mass, every)
+        return _expect(jnp.concatenate([lobe, fixed], 1), mass, share)
 
     def step(carry, _):
-        every, mean, concentration, responsibility = carry
+        share, mean, concentration, responsibility = carry
         taken = responsibility[:, :count]
-        found = jnp.sum(taken, 0)
+        taken_mass = jnp.sum(taken, 0)
         mean = _mean(taken, sample, mean)
         away = sum((sample[:, i, None] - mean[:, i]) ** 2 for i in range(3)) / 2 + extent[:, None]
-        spread = jnp.sum(taken * away, 0) / jnp.where(found > 0, found, 1)
+        spread = jnp.sum(taken * away, 0) / jnp.where(taken_mass > 0, taken_mass, 1)
         sharper = jnp.clip(concentration_of(spread), least, most)
-        concentration = jnp.where(found > 0, sharper, concentration)
+        concentration = jnp.where(taken_mass > 0, sharper, concentration)
         fresh = jnp.sum(responsibility, 0)
         responsibility, likelihood = expect(fresh, mean, concentration)
-        return (fresh, mean, concentration, responsibility), (likelihood, jnp.sum(jnp.abs(fresh - every)) / 2)
+        return (fresh, mean, concentration, responsibility), (likelihood, jnp.sum(jnp.abs(fresh - share)) / 2)
 
-    responsibility, first = expect(every, start.mean, start.concentration)
-    carry = (every, start.mean, start.concentration, responsibility)
-    (every, mean, concentration, _), (likelihood, residual) = jax.lax.scan(step, carry, None, length=steps)
-    every = every * total
+    responsibility, first = expect(share, start.mean, start.concentration)
+    carry = (share, start.mean, start.concentration, responsibility)
+    (share, mean, concentration, _), (likelihood, residual) = jax.lax.scan(step, carry, None, length=steps)
+    share = share * total
     likelihood = jnp.concatenate([first[None], likelihood])
-    return Fit(Mixture(every[:count], mean, concentration), every[count:], likelihood, residual)
+    return Fit(Mixture(share[:count], mean, concentration), share[count:], likelihood, residual)
 
 
 @partial(jit, static_argnames=("steps",))
@@ -239,11 +239,11 @@ _drop = drop  # `concentration_of` has an argument of the same name.
 def _expect(density: Array, mass: Array, weight: Array) -> tuple[Array, Array]:
     """Mass of each sample that belongs to each component, and the log-likelihood."""
     alive = (weight > 0) & (density > -jnp.inf)
-    each = jnp.where(alive, jnp.where(alive, density, 0) + jnp.log(jnp.where(weight > 0, weight, 1)), -jnp.inf)
-    best = jnp.max(each, 1, initial=-jnp.inf)
+    joint = jnp.where(alive, jnp.where(alive, density, 0) + jnp.log(jnp.where(weight > 0, weight, 1)), -jnp.inf)
+    best = jnp.max(joint, 1, initial=-jnp.inf)
     known = best > -jnp.inf
     best = jnp.where(known, best, 0)
-    part = jnp.exp(each - best[:, None])
+    part = jnp.exp(joint - best[:, None])
     whole = jnp.sum(part, 1)
     safe = jnp.where(known, whole, 1)
     taken = jnp.where(known, mass, 0)

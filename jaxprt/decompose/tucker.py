@@ -43,7 +43,7 @@ class Tucker(eqx.Module):
     @property
     def nbytes(self) -> int:
         """Size of the core and all factors in bytes."""
-        return self.core.nbytes + sum(each.nbytes for each in self.factor)
+        return self.core.nbytes + sum(matrix.nbytes for matrix in self.factor)
 
     def full(self) -> Float[Array, "*n"]:
         """The tensor that this decomposition represents."""
@@ -66,7 +66,7 @@ def multiply(tensor: Float[Array, "*n"], matrix: Float[Array, "m r"], *, mode: i
         return (slices[..., 0] @ matrix).reshape(shape)
     if slices.shape[0] == 1:
         return (matrix.T @ slices[0]).reshape(shape)
-    return jax.lax.map(lambda each: matrix.T @ each, slices).reshape(shape)
+    return jax.lax.map(lambda block: matrix.T @ block, slices).reshape(shape)
 
 
 @partial(jit, static_argnames=("mode",))
@@ -78,7 +78,9 @@ def gram(tensor: Float[Array, "*n"], *, mode: int) -> Float[Array, "m m"]:
     if slices.shape[0] == 1:
         return _square(slices[0])
     size = slices.shape[1]
-    return jax.lax.scan(lambda sum, each: (sum + each @ each.T, None), jnp.zeros((size, size), tensor.dtype), slices)[0]
+    return jax.lax.scan(
+        lambda sum, block: (sum + block @ block.T, None), jnp.zeros((size, size), tensor.dtype), slices
+    )[0]
 
 
 @partial(jit, static_argnames=("ranks",))
@@ -139,8 +141,8 @@ def _square(matrix: Array) -> Array:
     rest = matrix[:, count * _BLOCK :]
 
     def add(total, start):
-        each = jax.lax.dynamic_slice_in_dim(matrix, start, _BLOCK, 1)
-        return total + each @ each.T, None
+        columns = jax.lax.dynamic_blockin_dim(matrix, start, _BLOCK, 1)
+        return total + columns @ columns.T, None
 
     return jax.lax.scan(add, rest @ rest.T, _BLOCK * jnp.arange(count))[0] if count else rest @ rest.T
 
@@ -180,11 +182,11 @@ def dominant(matrix: Float[Array, "m m"], rank: int) -> Float[Array, "m r"]:
 def _dominant_jvp(rank, primal, tangent):
     (matrix,), (moved,) = primal, tangent
     vector = dominant(matrix, rank)
-    every, basis = jnp.linalg.eigh(matrix)
+    value, basis = jnp.linalg.eigh(matrix)
     # Rotations within the subspace are left out. The change of the subspace is a sum over the other eigenvectors.
-    other, low = basis[:, : len(every) - rank], every[: len(every) - rank]
+    other, low = basis[:, : len(value) - rank], value[: len(value) - rank]
     gap = jnp.einsum("ir,ij,jr->r", vector, matrix, vector) - low[:, None]
-    least = len(every) * jnp.finfo(matrix.dtype).eps * jnp.abs(every[-1])
+    least = len(value) * jnp.finfo(matrix.dtype).eps * jnp.abs(value[-1])
     open_gap = gap > least
     turned = jnp.where(open_gap, (other.T @ moved @ vector) / jnp.where(open_gap, gap, 1), 0)
     return vector, other @ turned
@@ -195,16 +197,16 @@ def _check(tensor: Array, ranks: tuple[int, ...]) -> None:
         raise ValueError(f"ranks must be one for each mode, from 1 to its size in {list(tensor.shape)}, got {ranks}")
 
 
-def oriented(decomposition: Tucker) -> Tucker:
+def orient(decomposition: Tucker) -> Tucker:
     """An equal decomposition whose factors are the same on every processor, up to rounding.
 
     Each factor is multiplied by the orthogonal matrix of `jaxprt.decompose.eigen.orientation`, and the core by its
     inverse, so the represented tensor does not change.
     """
     core, factor = np.asarray(decomposition.core), []
-    for mode, each in enumerate(map(np.asarray, decomposition.factor)):
+    for mode, matrix in enumerate(map(np.asarray, decomposition.factor)):
         unfolded = np.moveaxis(core, mode, 0).reshape(core.shape[mode], -1)
-        turn = eigen.orientation(np.sum(unfolded**2, 1), each).astype(core.dtype)
+        turn = eigen.orientation(np.sum(unfolded**2, 1), matrix).astype(core.dtype)
         core = np.moveaxis(np.tensordot(turn, core, (0, mode)), 0, mode)
-        factor.append(jax.device_put(each @ turn))
+        factor.append(jax.device_put(matrix @ turn))
     return Tucker(jax.device_put(core), tuple(factor))

@@ -245,8 +245,10 @@ def pad(cubemap: Float[Array, "6 n n *c"]) -> Float[Array, "6 m m *c"]:
     n = cubemap.shape[1]
     texel, index = cubemap.reshape(6 * n * n, *cubemap.shape[3:]), _border_index(n)
     outer, inner = np.array([0, n + 1]), np.array([1, n])
-    own, beside, above = (texel[index[:, i[:, None], j]] for i, j in ((inner, inner), (inner, outer), (outer, inner)))
-    corner = own + ((beside - own) + (above - own)) / 3
+    inside, beside, above = (
+        texel[index[:, i[:, None], j]] for i, j in ((inner, inner), (inner, outer), (outer, inner))
+    )
+    corner = inside + ((beside - inside) + (above - inside)) / 3
     return texel[index].at[:, outer[:, None], outer].set(corner, unique_indices=True)
 
 

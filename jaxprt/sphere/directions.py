@@ -27,7 +27,7 @@ def normalize(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
         [[0.  0.6 0.8]
          [0.  1.  0. ]]
     """
-    scaled, zero = _scaled(vector)
+    scaled, zero = _scale(vector)
     safe = jnp.where(zero, _axis(1, vector.dtype), scaled)
     return safe / jnp.sqrt(jnp.sum(safe**2, axis=-1, keepdims=True))
 
@@ -76,7 +76,7 @@ def frame(normal: Float[Array, "*b 3"], tangent: Float[Array, "*b 3"]) -> Float[
     Returns:
         Proper rotations; the rows are tangent, bitangent (normal x tangent) and normal.
     """
-    scaled, _ = _scaled(tangent)
+    scaled, _ = _scale(tangent)
     across = _reject(scaled, normal)
     limit = (_PARALLEL * jnp.finfo(normal.dtype).eps) ** 2
     parallel = jnp.sum(across**2, axis=-1, keepdims=True) < limit
@@ -140,7 +140,7 @@ def _axis(index: int, dtype: jnp.dtype) -> Float[Array, "3"]:
     return jnp.zeros(3, dtype).at[index].set(1)
 
 
-def _scaled(vector: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3"], Array]:
+def _scale(vector: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3"], Array]:
     """Vectors over their largest component, so that squares neither overflow nor underflow; and which are zero."""
     size = jax.lax.stop_gradient(jnp.max(jnp.abs(vector), axis=-1, keepdims=True))
     tiny = jnp.finfo(vector.dtype).tiny

@@ -340,7 +340,7 @@ def natural(*, degree: int) -> Float[Array, " l"]:
     return 1 / (jnp.arange(degree + 1) + 0.5)
 
 
-def least_laplacian(coefficient: Float[Array, "lm *c"], kept: Float[Array, ""]) -> Float[Array, " l"]:
+def least_laplacian(coefficient: Float[Array, "lm *c"], share: Float[Array, ""]) -> Float[Array, " l"]:
     """Factors of the window 1 / (1 + lambda l^2 (l+1)^2), which reduces ringing with the least change of the function.
 
     The window minimizes the squared change plus lambda times the squared Laplacian, both integrated over the sphere.
@@ -348,27 +348,27 @@ def least_laplacian(coefficient: Float[Array, "lm *c"], kept: Float[Array, ""]) 
 
     Args:
         coefficient: SH coefficients of the function to be windowed.
-        kept: Share of the squared Laplacian that remains, from 0 to 1. 0 keeps the mean only.
+        share: Share of the squared Laplacian that remains, from 0 to 1. 0 keeps the mean only.
 
     Returns:
-        One factor for each band, for `convolve`. All are 1 if the function is constant. Inside `jax.jit`, where `kept`
+        One factor for each band, for `convolve`. All are 1 if the function is constant. Inside `jax.jit`, where `share`
         cannot be checked, a negative share gives NaN.
 
     Raises:
-        ValueError: `kept` is not between 0 and 1.
+        ValueError: `share` is not between 0 and 1.
 
     Reference: Sloan 2008, "Stupid spherical harmonics tricks", section on windowing.
     """
-    if not isinstance(kept, Tracer) and not 0 <= np.asarray(kept) <= 1:
-        raise ValueError(f"kept, the share of the squared Laplacian that remains, must be from 0 to 1, got {kept}")
-    return _least_laplacian(coefficient, kept)
+    if not isinstance(share, Tracer) and not 0 <= np.asarray(share) <= 1:
+        raise ValueError(f"share, of the squared Laplacian that remains, must be from 0 to 1, got {share}")
+    return _least_laplacian(coefficient, share)
 
 
 @jit
-def _least_laplacian(coefficient: Array, kept: Array) -> Array:
+def _least_laplacian(coefficient: Array, share: Array) -> Array:
     degree = degree_of(coefficient.shape[0])
     band = _band(degree)
-    coefficient = coefficient.astype(jnp.result_type(coefficient, kept))  # The loop below keeps the type of its start.
+    coefficient = coefficient.astype(jnp.result_type(coefficient, share))  # The loop below keeps the type of its start.
     energy = jnp.sum(coefficient.reshape(len(band), -1) ** 2, -1)
     weight = jnp.asarray((np.arange(degree + 1) * np.arange(1, degree + 2)) ** 2, coefficient.dtype)
     spectrum = jax.ops.segment_sum(energy, jnp.asarray(band), degree + 1) * weight
@@ -380,14 +380,14 @@ def _least_laplacian(coefficient: Array, kept: Array) -> Array:
         # Newton's method for 1 / sqrt(remaining share), which is linear in the strength for one band and concave for
         # several. From 0 it approaches the root from below, quickly for any share.
         factor = 1 / (1 + strength * weight)
-        remains = jnp.where(some, jnp.sum(spectrum * factor**2), kept)
+        remains = jnp.where(some, jnp.sum(spectrum * factor**2), share)
         slope = jnp.where(some, jnp.sum(spectrum * factor**3 * weight), 1)
-        return strength + remains / slope * (jnp.sqrt(remains / some_kept) - 1), None
+        return strength + remains / slope * (jnp.sqrt(remains / some_share) - 1), None
 
-    some_kept = jnp.where(kept == 0, 1, kept)  # A share of 0 is the limit of infinite strength.
+    some_share = jnp.where(share == 0, 1, share)  # A share of 0 is the limit of infinite strength.
     strength, _ = jax.lax.scan(step, jnp.zeros((), coefficient.dtype), length=_NEWTON_STEPS)
     factor = 1 / (1 + jnp.maximum(strength, 0) * weight)
-    return jnp.where((kept == 0) & some, weight == 0, factor)
+    return jnp.where((share == 0) & some, weight == 0, factor)
 
 
 @functools.partial(jit, static_argnames="degree")

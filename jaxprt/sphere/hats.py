@@ -83,11 +83,11 @@ def inverse_gram(value: Float[Array | np.ndarray, "6 n n *c"], *, cells: int) ->
         size, dtype = value.shape[1], str(value.dtype)
         if isinstance(value, np.ndarray | Tracer):
             return _inverse_gram(size, cells, dtype)
-        return _placed(size, cells, dtype, min(value.devices(), key=lambda device: device.id))
+        return _on_device(size, cells, dtype, min(value.devices(), key=lambda device: device.id))
 
 
 @functools.lru_cache(maxsize=8)
-def _placed(size: int, cells: int, dtype: str, device: Any) -> Array:
+def _on_device(size: int, cells: int, dtype: str, device: Any) -> Array:
     with jax.default_device(device):
         return jax.device_put(_inverse_gram(size, cells, dtype))
 

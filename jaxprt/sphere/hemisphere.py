@@ -160,7 +160,7 @@ def arcs(middle: Float[Array, "3"], *, rings: int, sectors: int) -> tuple[Float[
     Returns:
         Unit directions of the nodes, and the solid angle of each in sr.
     """
-    place, weight = (jnp.asarray(each, middle.dtype)[:, None] for each in _arc(rings))
+    place, weight = (jnp.asarray(array, middle.dtype)[:, None] for array in _arc(rings))
     angle = 2 * np.pi * (np.arange(sectors) + 0.5) / sectors
     cosine, sine = jnp.asarray(np.cos(angle), middle.dtype), jnp.asarray(np.sin(angle), middle.dtype)
     # rows: horizontal, upwards, middle; at the normal any horizontal direction serves

@@ -102,7 +102,7 @@ def directional_light(coefficient: Float[Array, "lm *c"]) -> tuple[Float[Array, 
     faces the light, for which E is 16 pi / 17 at degree 2.
     """
     direction = dominant_direction(coefficient)
-    there = _where_directed(direction, harmonics.reconstruct(coefficient, direction))
+    there = _zero_without_direction(direction, harmonics.reconstruct(coefficient, direction))
     return direction, there * (4 * jnp.pi / coefficient.shape[0])
 
 
@@ -133,11 +133,11 @@ def directional_and_ambient(
     direction = dominant_direction(coefficient)
     terms = coefficient.shape[0]
     mean = coefficient[0] / jnp.sqrt(4 * jnp.pi).astype(coefficient.dtype)
-    excess = _where_directed(direction, (harmonics.reconstruct(coefficient, direction) - mean) / (terms - 1))
+    excess = _zero_without_direction(direction, (harmonics.reconstruct(coefficient, direction) - mean) / (terms - 1))
     return direction, 4 * jnp.pi * excess, mean - excess
 
 
-def _where_directed(direction: Array, value: Array) -> Array:
+def _zero_without_direction(direction: Array, value: Array) -> Array:
     """The value, or zero if there is no dominant direction."""
     return jnp.where(jnp.any(direction != 0), value, 0)
 
@@ -172,7 +172,7 @@ def product(first: Float[Array, "i *c"], second: Float[Array, "j *#c"], *, degre
     """
     of_first, of_second = harmonics.degree_of(first.shape[0]), harmonics.degree_of(second.shape[0])
     values = _tables(of_first, of_second, degree)
-    one, other, back = (jnp.asarray(each, first.dtype) for each in values)
+    one, other, back = (jnp.asarray(basis, first.dtype) for basis in values)
     at_nodes = jnp.tensordot(one, first, axes=1) * jnp.tensordot(other, second, axes=1)
     return jnp.tensordot(back, at_nodes, axes=1)
 
@@ -193,9 +193,9 @@ def operator(coefficient: Float[Array, "i *c"], *, degree: int) -> Float[Array, 
 
     Reference: Sloan 2008, "Stupid spherical harmonics tricks", section on products.
     """
-    own, other, back = _tables(harmonics.degree_of(coefficient.shape[0]), degree, degree)
-    own, other, back = (jnp.asarray(each, coefficient.dtype) for each in (own, other, back))
-    value = jnp.tensordot(own, coefficient, axes=1)
+    fixed, other, back = _tables(harmonics.degree_of(coefficient.shape[0]), degree, degree)
+    fixed, other, back = (jnp.asarray(basis, coefficient.dtype) for basis in (fixed, other, back))
+    value = jnp.tensordot(fixed, coefficient, axes=1)
     weighted = back.reshape(*back.shape, *(1,) * (value.ndim - 1)) * value
     return jnp.moveaxis(jnp.tensordot(weighted, other, axes=(1, 0)), -1, 1)
 
@@ -224,7 +224,7 @@ def triple(
 def _tables(first: int, second: int, degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Basis functions at the nodes for both factors, [q, i] and [q, j], and weighted for the result, [k, q]."""
     node, weight = harmonics.quadrature(first + second + max(degree, 0))
-    one, other, back = (harmonics.basis(np, node, each) for each in (first, second, degree))
+    one, other, back = (harmonics.basis(np, node, band) for band in (first, second, degree))
     return one.T, other.T, back * weight
 
 
@@ -262,7 +262,7 @@ class Convention:
         signs = np.array([1.0 if sign == "+" else -1.0 for sign in self.axes[::2]])
         return signs[:, None] * np.eye(3)[["xyz".index(letter) for letter in self.axes[1::2]]]
 
-    def written(self, coefficient: ArrayLike, *, axis: int = 0, world: bool = True) -> Float[np.ndarray, "..."]:
+    def write(self, coefficient: ArrayLike, *, axis: int = 0, world: bool = True) -> Float[np.ndarray, "..."]:
         """Converts coefficients from jaxprt's convention to the tool's.
 
         Args:
@@ -277,7 +277,7 @@ class Convention:
         return _along(coefficient, axis, lambda degree: self._matrix(degree, world))
 
     def read(self, coefficient: ArrayLike, *, axis: int = 0, world: bool = True) -> Float[np.ndarray, "..."]:
-        """Converts coefficients from the tool's convention to jaxprt's. This is the inverse of `written`.
+        """Converts coefficients from the tool's convention to jaxprt's. This is the inverse of `write`.
 
         Args:
             coefficient: SH coefficients in the tool's order along one axis.
@@ -292,7 +292,7 @@ class Convention:
     def _matrix(self, degree: int, world: bool) -> np.ndarray:
         """Orthogonal matrix from jaxprt's coefficients to the tool's."""
         m = np.concatenate([np.arange(-l, l + 1) for l in range(degree + 1)])
-        matrix = _turned(degree, self.axes) if world else np.eye(len(m))
+        matrix = _axes_matrix(degree, self.axes) if world else np.eye(len(m))
         if self.condon_shortley:
             matrix = matrix * np.where(m % 2, -1.0, 1.0)[:, None]
         return matrix[_order(degree, self.order)]
@@ -331,7 +331,7 @@ def _order(degree: int, order: str) -> np.ndarray:
 
 
 @lru_cache(maxsize=32)
-def _turned(degree: int, axes: str) -> np.ndarray:
+def _axes_matrix(degree: int, axes: str) -> np.ndarray:
     """Matrix of the tool's basis functions in terms of jaxprt's, from the difference in axes. Zeros are exact."""
     if axes == Convention.axes:
         return np.eye((degree + 1) ** 2)

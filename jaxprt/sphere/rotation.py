@@ -55,7 +55,7 @@ def rotate(coefficient: Float[Array, "lm *c"], rotation: Float[Array, "3 3"]) ->
 
     Reference: Kautz, Sloan, Snyder 2002, appendix.
     """
-    return _rotated(coefficient, rotation)
+    return _rotate(coefficient, rotation)
 
 
 @jit
@@ -79,7 +79,7 @@ def rotate_each(coefficient: Float[Array, "lm c *v"], rotation: Float[Array, "w 
         raise ValueError(
             f"the last axis must have one entry for each of the {count} rotations, got the shape {coefficient.shape}"
         )
-    return _rotated(coefficient, jnp.moveaxis(rotation, 0, -1))
+    return _rotate(coefficient, jnp.moveaxis(rotation, 0, -1))
 
 
 @jit
@@ -118,26 +118,26 @@ def matrix(rotation: Float[Array, "3 3"], *, degree: int) -> Float[Array, "lm lm
 
 
 @functools.partial(jax.custom_jvp)
-def _rotated(coefficient: Array, rotation: Array) -> Array:
+def _rotate(coefficient: Array, rotation: Array) -> Array:
     """Rotates coefficients [lm, *c] by rotations [3, 3, *v], where *v broadcasts against the last axes of *c."""
     degree = harmonics.degree_of(coefficient.shape[0])
     shape = jnp.broadcast_shapes(coefficient.shape[1:], rotation.shape[2:])
     hand = _hand(rotation)
     angle = _euler_angles(rotation * hand)
     if degree <= _UNROLLED:
-        row = _turn_rows(coefficient, hand, *(_multiples(*each, degree) for each in angle))
-        return jnp.stack([jnp.broadcast_to(each, shape) for each in row])
-    band = _turn_bands(coefficient, hand, *(_signed_multiples(*each, degree, coefficient.ndim) for each in angle))
-    return jnp.concatenate([jnp.broadcast_to(each, (len(each), *shape)) for each in band])
+        row = _turn_rows(coefficient, hand, *(_multiples(*part, degree) for part in angle))
+        return jnp.stack([jnp.broadcast_to(part, shape) for part in row])
+    band = _turn_bands(coefficient, hand, *(_signed_multiples(*part, degree, coefficient.ndim) for part in angle))
+    return jnp.concatenate([jnp.broadcast_to(part, (len(part), *shape)) for part in band])
 
 
-@functools.partial(_rotated.defjvp, symbolic_zeros=True)
-def _rotated_jvp(primal, tangent):
+@functools.partial(_rotate.defjvp, symbolic_zeros=True)
+def _rotate_jvp(primal, tangent):
     coefficient, rotation = primal
-    result = _rotated(coefficient, rotation)
+    result = _rotate(coefficient, rotation)
     change = jnp.zeros_like(result)
     if not isinstance(tangent[0], SymbolicZero):
-        change = _rotated(tangent[0], rotation)
+        change = _rotate(tangent[0], rotation)
     if not isinstance(tangent[1], SymbolicZero):
         relative = jnp.einsum("ij...,kj...->ik...", tangent[1], rotation, precision="highest")
         turn = [(relative[i, j] - relative[j, i]) / 2 for i, j in ((2, 1), (0, 2), (1, 0))]
@@ -168,7 +168,7 @@ def _turn_rows(coefficient: Array, hand: Array, alpha: tuple, beta: tuple, gamma
         quarter = _quarter_turn(l)
         row = fixed(about_z(list(coefficient[l * l : (l + 1) ** 2]), gamma), quarter.T)
         row = about_z(fixed(about_z(row, beta), quarter), alpha)
-        result.extend([each * hand for each in row] if l % 2 else row)
+        result.extend([part * hand for part in row] if l % 2 else row)
     return result
 
 

@@ -149,11 +149,11 @@ def test_ranks_that_do_not_fit_are_refused(decompose, ranks):
 
 def test_oriented_factors_do_not_depend_on_signs_and_stand_for_the_same_tensor():
     found = tucker.truncated(jnp.asarray(decaying((5, 6, 7)), jnp.float32), ranks=(3, 3, 3))
-    first = tucker.oriented(found)
+    first = tucker.orient(found)
     turned = tucker.Tucker(
         found.core * jnp.array([1, -1, 1.0]), (*found.factor[:2], found.factor[2] * jnp.array([1, -1, 1.0]))
     )
-    for one, other in zip(first.factor, tucker.oriented(turned).factor, strict=True):
+    for one, other in zip(first.factor, tucker.orient(turned).factor, strict=True):
         np.testing.assert_allclose(one, other, atol=EXACT)
     np.testing.assert_allclose(full(first), full(found), atol=EXACT * float(np.linalg.norm(full(found))))
 

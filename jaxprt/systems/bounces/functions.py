@@ -86,7 +86,7 @@ def factor(
     _check_count("terms", terms, found.tensor.shape[3])
     smooth = _smoothed(found)
     kinds = min(smooth.shape[1], len(found.area))
-    least = tucker.oriented(tucker.truncated(smooth, ranks=(functions, kinds, terms)))
+    least = tucker.orient(tucker.truncated(smooth, ranks=(functions, kinds, terms)))
     view, light = _maps(found, least)
     rows = [_projected(smooth, least)]
     for first in range(0, len(middle) if dense else 0, _TOGETHER):
@@ -125,7 +125,7 @@ def shared(
     smooth, colors = _smoothed(found), found.tensor.shape[1]
     kinds = min(smooth.shape[1], len(found.area))
     ranks = (min(functions, len(smooth)), kinds, min(terms, found.tensor.shape[3]))
-    least = tucker.oriented(tucker.truncated(smooth, ranks=ranks))
+    least = tucker.orient(tucker.truncated(smooth, ranks=ranks))
     view, light = _maps(found, least)
     along = _projected(smooth, least)
     error = _missed(smooth, along, least)

@@ -257,7 +257,7 @@ def decompose(
     inside = np.flatnonzero(np.asarray(weight))
     check_ranks(ranks, (count * colors, len(inside), tensor.shape[3]))
     flat, met = _met(tensor, weight, inside)
-    found = tucker.oriented(tucker.truncated(met, ranks=tuple(ranks)))
+    found = tucker.orient(tucker.truncated(met, ranks=tuple(ranks)))
     core, along, view, light, error = _maps(found, flat, met, to_map, weight, whole, inside)
     return DynamicBrdf(core, along.reshape(count, colors, -1), view, light, *rest, error, coordinates)
 

@@ -68,10 +68,10 @@ def export_transfer(
             "matrices of vertices, or vectors of corners, to .npz or .npy files"
         )
     if isinstance(transport, TransferMatrix):
-        inner = convention.written(np.asarray(transport.matrix), axis=3)
-        value = convention.written(inner, axis=2, world=False)
+        inner = convention.write(np.asarray(transport.matrix), axis=3)
+        value = convention.write(inner, axis=2, world=False)
     else:
-        value = convention.written(np.asarray(transport.vector), axis=0).transpose(2, 0, 1)
+        value = convention.write(np.asarray(transport.vector), axis=0).transpose(2, 0, 1)
         value = value if convention.over_pi else value * np.asarray(np.pi, value.dtype)
         value = value[np.asarray(mesh.face)] if corners else value
     position = np.asarray(mesh.position)
@@ -125,7 +125,7 @@ def import_transfer(
     held = _read(pathlib.Path(path), kind)
     if "coefficient" not in held:
         raise ValueError(f"{source} must hold an array `coefficient`, got {', '.join(sorted(held)) or 'none'}")
-    stated = _said(source, str(held["convention"])) if "convention" in held else convention
+    stated = _parse_convention(source, str(held["convention"])) if "convention" in held else convention
     if stated is None:
         raise ValueError(
             f"{source} does not say its convention: give convention=jaxprt.sphere.low_frequency.Convention(..)"
@@ -138,12 +138,12 @@ def import_transfer(
     turn = convention.turn.astype(np.float32)
     if "position" in held:
         position = _numbers(source, "position", held["position"], np.float64, axes=3)
-        _same(f"positions of {source}", position @ convention.turn - mesh.origin, np.asarray(mesh.position))
+        _require_same(f"positions of {source}", position @ convention.turn - mesh.origin, np.asarray(mesh.position))
     if what == "matrices":
         frame = directions.frame(mesh.normal, mesh.tangent)
         if "frame" in held:
             axes = _numbers(source, "frame", held["frame"], axes=3)
-            _same(f"frames of {source}", axes @ turn, np.asarray(frame))
+            _require_same(f"frames of {source}", axes @ turn, np.asarray(frame))
         return TransferMatrix(jnp.asarray(_matrices(source, value, mesh, convention)), mesh.position, frame)
     if what not in ("vectors", "vectors of corners"):
         raise ValueError(f'what must be "vectors", "vectors of corners" or "matrices", got {what!r}')
@@ -153,7 +153,7 @@ def import_transfer(
         axes = ", ".join(map(str, rows))
         raise ValueError(f"{what} of {source} must be [{axes}, lm] or [{axes}, lm, c], got {list(value.shape)}")
     if what == "vectors of corners":
-        value = _joined(source, value, np.asarray(mesh.face), len(mesh.position))
+        value = _join_corners(source, value, np.asarray(mesh.face), len(mesh.position))
     value = convention.read(value, axis=1) / np.float32(1 if convention.over_pi else np.pi)
     return TransferVector(jnp.asarray(value.transpose(1, 2, 0)), mesh.position)
 
@@ -196,7 +196,7 @@ def _numbers(
     return value
 
 
-def _said(source: str, text: str) -> Convention:
+def _parse_convention(source: str, text: str) -> Convention:
     """The convention that a file states."""
     try:
         convention = Convention(**json.loads(text))
@@ -220,7 +220,7 @@ def _matrices(source: str, value: np.ndarray, mesh: Mesh, convention: Convention
     return convention.read(convention.read(value, axis=3), axis=2, world=False)
 
 
-def _joined(source: str, value: np.ndarray, face: np.ndarray, count: int) -> np.ndarray:
+def _join_corners(source: str, value: np.ndarray, face: np.ndarray, count: int) -> np.ndarray:
     """Coefficients of vertices from those of triangle corners, which must agree at each vertex."""
     result = np.full((count, *value.shape[2:]), np.nan, value.dtype)
     result[face] = value
@@ -237,18 +237,18 @@ def _joined(source: str, value: np.ndarray, face: np.ndarray, count: int) -> np.
     return result
 
 
-def _same(name: str, found: np.ndarray, wanted: np.ndarray) -> None:
+def _require_same(name: str, actual: np.ndarray, wanted: np.ndarray) -> None:
     """Refuses positions or frames in a file that differ from those of the mesh."""
-    if found.shape != wanted.shape:
+    if actual.shape != wanted.shape:
         raise ValueError(
-            f"{name} must have the shape of those of the mesh, {list(wanted.shape)}, got {list(found.shape)}"
+            f"{name} must have the shape of those of the mesh, {list(wanted.shape)}, got {list(actual.shape)}"
         )
-    off = np.abs(found - wanted).reshape(len(found), -1).max(1)
+    off = np.abs(actual - wanted).reshape(len(actual), -1).max(1)
     wrong = np.flatnonzero(~(off <= _AGREE * max(float(np.abs(wanted).max()), 1e-30)))
     if len(wrong):
         raise ValueError(
             f"{name} must be those of the mesh, in the axes of jaxprt, got {len(wrong)} of {len(off)} that are not, "
-            f"first {wrong[0]}: {found[wrong[0]].tolist()} instead of {wanted[wrong[0]].tolist()}"
+            f"first {wrong[0]}: {actual[wrong[0]].tolist()} instead of {wanted[wrong[0]].tolist()}"
         )
 
 

@@ -203,8 +203,8 @@ def project(light: Environment, *, degree: int) -> Float[Array, "*l lm c"]:
         ValueError: The light is not finite, or the degree is negative.
     """
     *batch, faces, edge, _, colors = light.radiance.shape
-    every = jnp.moveaxis(light.radiance.reshape(-1, faces, edge, edge, colors), 0, -1)
-    coefficient = harmonics.project(every, degree=degree)
+    radiance = jnp.moveaxis(light.radiance.reshape(-1, faces, edge, edge, colors), 0, -1)
+    coefficient = harmonics.project(radiance, degree=degree)
     return jnp.moveaxis(coefficient, -1, 0).reshape(*batch, -1, colors)
 
 

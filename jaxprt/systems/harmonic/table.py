@@ -97,8 +97,8 @@ class HarmonicBrdf(eqx.Module):
             ValueError: The number of parameters differs from the table's.
         """
         if len(parameter) != len(self.knot):
-            given = f"{len(self.knot)} parameters, got {len(parameter)}"
-            raise ValueError(f"the table needs {given}; a system takes them in its materials, as `Blend.parameter`")
+            needed = f"{len(self.knot)} parameters, got {len(parameter)}"
+            raise ValueError(f"the table needs {needed}; a system takes them in its materials, as `Blend.parameter`")
         resolution = self.table.shape[-1]
         # At the normal the azimuth is undefined. There (x, y) / sin_o is 0, and so are all coefficients except m = 0.
         sin_o = jnp.sqrt(wo[:, 0] ** 2 + wo[:, 1] ** 2 + _TINY)
@@ -108,9 +108,9 @@ class HarmonicBrdf(eqx.Module):
             spot = hemisphere.parabolic_coordinates(wo) * resolution - 0.5
             place = [spot[:, 1], spot[:, 0]]
         axis = [
-            grid.neighbors(grid.place(knot, each), size=len(knot))
-            for knot, each in zip(self.knot, parameter, strict=True)
-        ] + [grid.neighbors(each, size=resolution) for each in place]
+            grid.neighbors(grid.place(knot, value), size=len(knot))
+            for knot, value in zip(self.knot, parameter, strict=True)
+        ] + [grid.neighbors(coordinate, size=resolution) for coordinate in place]
         value = grid.read(self.table.reshape(-1, *self.table.shape[2:]), axis) * (wo[:, 2] > 0)
         value = value.reshape(*self.table.shape[:2], len(wo))
         return rotation.about_z(value, wo[:, 0] / sin_o, wo[:, 1] / sin_o) if self.isotropic else value
@@ -124,7 +124,7 @@ class HarmonicBrdf(eqx.Module):
         """
         batch = wo.shape[:-1]
         basis = harmonics.evaluate(wi.reshape(-1, 3), degree=self.degree)
-        row = self.coefficients(wo.reshape(-1, 3), *(each.reshape(-1) for each in parameter))
+        row = self.coefficients(wo.reshape(-1, 3), *(values.reshape(-1) for values in parameter))
         return jnp.einsum("vi,icv->vc", basis, row, precision="highest").reshape(*batch, row.shape[1])
 
 
@@ -172,32 +172,34 @@ def tabulate(
             "tabulate needs a degree of 0 to 50, a resolution of at least 2 and an error above 0, "
             f"got degree={degree}, resolution={resolution} and error={error}"
         )
-    knots = grid.checked(knot)
+    knots = grid.check_knots(knot)
     points = list(itertools.product(*knots))
-    halfway = list(itertools.product(*((each[1:] + each[:-1]) / 2 for each in knots))) if knots else []
-    made, between = (
-        [grid.as_argument(brdf(*map(jnp.asarray, each)) if knots else brdf) for each in every]
-        for every in (points, halfway)
+    halfway = list(itertools.product(*((values[1:] + values[:-1]) / 2 for values in knots))) if knots else []
+    at_points, between = (
+        [grid.as_argument(brdf(*map(jnp.asarray, point)) if knots else brdf) for point in group]
+        for group in (points, halfway)
     )
     # The quadrature is chosen for the first, middle and last parameters only.
     rule, finer, quadrature = _choose_rule(
-        [made[i] for i in sorted({0, len(made) // 2, len(made) - 1})], degree, wanted
+        [at_points[i] for i in sorted({0, len(at_points) // 2, len(at_points) - 1})], degree, wanted
     )
-    isotropic = all(_is_isotropic(each, max(wanted / 2, _ISOTROPIC), degree, rule) for each in made)
+    isotropic = all(_is_isotropic(model, max(wanted / 2, _ISOTROPIC), degree, rule) for model in at_points)
     wo = _probe_views()
-    truth, further = ([_project(each, wo, degree, finer) for each in every] for every in (made, between))
+    truth, further = ([_project(model, wo, degree, finer) for model in group] for group in (at_points, between))
     sizes = (_ANGLES if isotropic else _EDGES) if resolution is None else (resolution,)
     known: list[tuple[float, HarmonicBrdf]] = []
     for size in sizes:
         # The error of linear interpolation is of second order. Sizes that are predicted to miss it by far are skipped.
         if known and 2 * wanted * (size / known[-1][1].table.shape[-1]) ** 2 < known[-1][0] and size != sizes[-1]:
             continue
-        table = _table(made, points, knots, _nodes(size, isotropic), degree, rule)
-        known.append((_missed(table, wo, points, truth), table))
+        table = _table(at_points, points, knots, _nodes(size, isotropic), degree, rule)
+        known.append((_interpolation_error(table, wo, points, truth), table))
         if known[-1][0] <= wanted or (len(known) > 1 and not known[-1][0] <= _WORTHWHILE * known[-2][0]):
             break
     by_view, table = known[-1]
-    reached = max([by_view, _missed(table, wo, halfway, further)], key=lambda each: (np.isnan(each), each))
+    reached = max(
+        [by_view, _interpolation_error(table, wo, halfway, further)], key=lambda error: (np.isnan(error), error)
+    )
     if (error is not None or resolution is None) and not reached <= wanted:
         if by_view <= wanted:
             advice = "give knots that are closer to each other"
@@ -209,7 +211,7 @@ def tabulate(
             f"the error of the table of harmonics must be at most {wanted:.3g}, got {reached:.3g}: {advice}",
             stacklevel=2,
         )
-    return eqx.tree_at(lambda each: each.error, table, jnp.asarray(reached, table.table.dtype))
+    return eqx.tree_at(lambda stored: stored.error, table, jnp.asarray(reached, table.table.dtype))
 
 
 @partial(jit, static_argnames=("degree", "rings", "sectors"))
@@ -248,42 +250,42 @@ def _project(brdf: Callable, wo: Array, degree: int, rule: tuple[int, int]) -> n
     """`project` for many views, in blocks of the number of probes, so that one compiled program serves all."""
     block = np.resize(wo, (-(-len(wo) // _PROBES), _PROBES, 3))
     value = [
-        np.asarray(project(brdf, jnp.asarray(each), degree=degree, rings=rule[0], sectors=rule[1])) for each in block
+        np.asarray(project(brdf, jnp.asarray(views), degree=degree, rings=rule[0], sectors=rule[1])) for views in block
     ]
     return np.concatenate(value, -1)[..., : len(wo)]
 
 
 def _table(
-    made: Sequence[Callable], points: Sequence[tuple], knots: tuple, wo: Array, degree: int, rule: tuple[int, int]
+    models: Sequence[Callable], points: Sequence[tuple], knots: tuple, wo: Array, degree: int, rule: tuple[int, int]
 ) -> HarmonicBrdf:
     """The table of BRDFs at the view nodes `wo` [*q 3], with an error of NaN. Gray BRDFs are repeated to all colors.
 
     Raises:
         ValueError: A BRDF returns values that are not finite.
     """
-    tables = [_project(each, wo.reshape(-1, 3), degree, rule) for each in made]
+    tables = [_project(model, wo.reshape(-1, 3), degree, rule) for model in models]
     for point, table in zip(points, tables, strict=True):
         if not np.isfinite(table).all():
             at = f" at parameters {point}" if point else ""
             raise ValueError(f"the BRDF must be finite for all directions above the horizon, got NaN or infinity{at}")
     colors, dtype = max(table.shape[1] for table in tables), tables[0].dtype
-    every = np.stack([np.broadcast_to(each, (len(each), colors, each.shape[2])) for each in tables], 2)
-    value = every.reshape(len(every), colors, *map(len, knots), *wo.shape[:-1])
-    knot = tuple(jnp.asarray(each, dtype) for each in knots)
+    stack = np.stack([np.broadcast_to(table, (len(table), colors, table.shape[2])) for table in tables], 2)
+    value = stack.reshape(len(stack), colors, *map(len, knots), *wo.shape[:-1])
+    knot = tuple(jnp.asarray(values, dtype) for values in knots)
     return HarmonicBrdf(jax.device_put(value), knot, jax.device_put(np.asarray(np.nan, dtype)))
 
 
-def _missed(table: HarmonicBrdf, wo: Array, points: Sequence[tuple], truth: Sequence[np.ndarray]) -> float:
+def _interpolation_error(table: HarmonicBrdf, wo: Array, points: Sequence[tuple], truth: Sequence[np.ndarray]) -> float:
     """Largest relative error of interpolated coefficients over the given parameter values."""
     error = [0.0]
     for point, expected in zip(points, truth, strict=True):
-        value = np.asarray(_looked_up(table, wo, tuple(jnp.full(len(wo), each, wo.dtype) for each in point)))
+        value = np.asarray(_look_up(table, wo, tuple(jnp.full(len(wo), value, wo.dtype) for value in point)))
         error.append(_difference(value, np.broadcast_to(expected, value.shape)))
     return float(np.max(error))
 
 
 @jit
-def _looked_up(table: HarmonicBrdf, wo: Array, parameter: tuple[Array, ...]) -> Array:
+def _look_up(table: HarmonicBrdf, wo: Array, parameter: tuple[Array, ...]) -> Array:
     return table.coefficients(wo, *parameter)
 
 
@@ -324,7 +326,7 @@ def _is_isotropic(brdf: Callable, error: float, degree: int, rule: tuple[int, in
     height, angle = (number + 0.5) / len(number), 1 + number * np.pi * (3 - np.sqrt(5))
     both = jnp.concatenate([_views(height, 0 * angle), _views(height, angle)])
     straight, turned = np.split(_project(brdf, both, degree, rule), 2, -1)
-    cosine, sine = (jnp.asarray(each(angle), straight.dtype) for each in (np.cos, np.sin))
+    cosine, sine = (jnp.asarray(function(angle), straight.dtype) for function in (np.cos, np.sin))
     return _difference(np.asarray(rotation.about_z(jnp.asarray(straight), cosine, sine)), turned) <= error
 
 
@@ -335,7 +337,7 @@ def _choose_rule(
     wo = _probe_views()
 
     def integrals(rule):
-        return [_project(each, wo, degree, rule) for each in brdfs]
+        return [_project(brdf, wo, degree, rule) for brdf in brdfs]
 
     rule, finer, reached, coarse = _RULES[0], _RULES[1], np.inf, integrals(_RULES[0])
     for finer in _RULES[1:]:

@@ -204,10 +204,10 @@ def from_visibility(
         frame: Shading frame of each vertex; rows are tangent, bitangent, normal. See `right_handed`.
         degree: Highest degree of the matrices.
     """
-    node, weight = (jnp.asarray(each, frame.dtype) for each in harmonics.quadrature(4 * degree))
+    node, weight = (jnp.asarray(array, frame.dtype) for array in harmonics.quadrature(4 * degree))
     basis = harmonics.evaluate(node, degree=degree)
     value = weight[:, None] * (harmonics.evaluate(node, degree=2 * degree) @ coefficient)
-    world = jax.lax.map(lambda each: (basis * each[:, None]).T @ basis, value.T)
+    world = jax.lax.map(lambda value: (basis * value[:, None]).T @ basis, value.T)
     return jnp.moveaxis(rotation.rotate_each(jnp.moveaxis(world, 0, -1), right_handed(frame)), -1, 0)
 
 
@@ -226,9 +226,9 @@ def to_visibility(matrix: Float[Array, "b lm lm"], frame: Float[Array, "b 3 3"])
     degree = harmonics.degree_of(matrix.shape[-1])
     back = right_handed(frame).swapaxes(1, 2)
     world = jnp.moveaxis(rotation.rotate_each(jnp.moveaxis(matrix, 0, -1), back), -1, 0)
-    node, weight = (jnp.asarray(each, frame.dtype) for each in harmonics.quadrature(4 * degree))
+    node, weight = (jnp.asarray(array, frame.dtype) for array in harmonics.quadrature(4 * degree))
     basis = harmonics.evaluate(node, degree=degree)
-    convolved = jax.lax.map(lambda each: jnp.sum((basis @ each) * basis, -1), world)
+    convolved = jax.lax.map(lambda matrix: jnp.sum((basis @ matrix) * basis, -1), world)
     coefficient = (weight[:, None] * harmonics.evaluate(node, degree=2 * degree)).T @ convolved.T
     return harmonics.convolve(coefficient, jnp.asarray(1 / _squared_kernel(degree), frame.dtype))
 
@@ -301,8 +301,8 @@ class _Job(visibility.rays.VisibilityJob):
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         seen, count = self.seen(block)
         name, function = ("vector", transfer_diffuse) if self.diffuse else ("matrix", transfer)
-        made = function(seen, self.frame[self.part(block)], degree=self.degree)
-        return {name: np.asarray(made)[:, None]}, count.rays
+        value = function(seen, self.frame[self.part(block)], degree=self.degree)
+        return {name: np.asarray(value)[:, None]}, count.rays
 
 
 def check_memory(vertices: int, degree: int, *, copies: int = 1, colors: int = 1, in_files: bool = False) -> None:
@@ -319,10 +319,10 @@ def check_memory(vertices: int, degree: int, *, copies: int = 1, colors: int = 1
     Raises:
         MemoryError: The matrices do not fit.
     """
-    each = 4 * (degree + 1) ** 4 * colors
+    size = 4 * (degree + 1) ** 4 * colors
     require.memory(
-        f"transfer matrices of degree {degree} for {vertices:,} vertices, {each:,} bytes each,",
-        copies * vertices * each,
+        f"transfer matrices of degree {degree} for {vertices:,} vertices, {size:,} bytes each,",
+        copies * vertices * size,
         "take a lower degree, or fewer vertices (vertex=)",
         in_files=in_files,
     )

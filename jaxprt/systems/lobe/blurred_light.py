@@ -76,7 +76,7 @@ def scales(size: int) -> Scales:
     width = [texel / 2]
     while len(width) < 2 or width[-1] * _RATIO < _WIDEST:
         width.append(_FIRST * texel * _RATIO ** (len(width) - 1))
-    edge = [size] + [_edge(each, size, least=4) for each in width[1:]]
+    edge = [size] + [_edge(w, size, least=4) for w in width[1:]]
     edge = np.array(edge, np.int32)
     count = 6 * (edge + 2) ** 2
     # The mean cosine is coth k - 1/k. For sharp lobes coth k is 1 to rounding.
@@ -124,8 +124,8 @@ def blur(edge: int, spread: float, *, size: int) -> tuple[int, float, float]:
     source = _edge(np.sqrt(spread), size, least=8)
     # Source texels (boxes) and bilinear lookup (tents) blur too; their variance is subtracted.
     texel = np.sqrt(4 * np.pi / 6) / np.array([edge, source])
-    own = max(spread - texel[0] ** 2 / 6 - texel[1] ** 2 / 12, 0.2 * texel[1] ** 2)
-    return source, own, float(mixture.concentration_of(jnp.asarray(own)))
+    variance = max(spread - texel[0] ** 2 / 6 - texel[1] ** 2 / 12, 0.2 * texel[1] ** 2)
+    return source, variance, float(mixture.concentration_of(jnp.asarray(variance)))
 
 
 def _edge(width: float, size: int, *, least: int) -> int:
@@ -145,34 +145,36 @@ def _blurs(radiance: Float[Array | np.ndarray, "6 n n c"]) -> Sequence[tuple[Arr
     with jax.ensure_compile_time_eval():  # Traced arrays could not be cached.
         size, dtype = radiance.shape[1], str(radiance.dtype)
         if isinstance(radiance, np.ndarray | Tracer):
-            return _made_blurs(size, dtype)
-        return _placed_blurs(size, dtype, min(radiance.devices(), key=lambda each: each.id))
+            return _host_blurs(size, dtype)
+        return _device_blurs(size, dtype, min(radiance.devices(), key=lambda device: device.id))
 
 
 @lru_cache(maxsize=4)
-def _placed_blurs(size: int, dtype: str, device: Any) -> list[tuple[Array, Array]]:
+def _device_blurs(size: int, dtype: str, device: Any) -> list[tuple[Array, Array]]:
     """Weights placed on a device but not committed to it, so that lights sharded over several devices can use them."""
     with jax.default_device(device):
-        return jax.device_put(_made_blurs(size, dtype))
+        return jax.device_put(_host_blurs(size, dtype))
 
 
 @lru_cache(maxsize=4)
-def _made_blurs(size: int, dtype: str) -> list[tuple[np.ndarray, np.ndarray]]:
+def _host_blurs(size: int, dtype: str) -> list[tuple[np.ndarray, np.ndarray]]:
     scale = scales(size)
     result = []
     for edge, spread in zip(scale.edge.tolist()[1:], scale.spread.tolist()[1:], strict=True):
-        source, own, concentration = blur(edge, spread, size=size)
+        source, variance, concentration = blur(edge, spread, size=size)
         center = np.asarray(cubemap.direction(size=source), np.float64).reshape(-1, 3)
         area = np.asarray(cubemap.solid_angle(size=source), np.float64).reshape(-1)
         tile = min(_TILE, edge)
         place = np.asarray(cubemap.direction(size=edge), np.float64)[0]
         place = place.reshape(edge // tile, tile, edge // tile, tile, 3).swapaxes(1, 2).reshape(-1, tile * tile, 3)
-        reach = 2 * np.sin(min(np.pi, REACH * np.sqrt(own)) / 2)
-        near = [np.unique(np.concatenate(each)) for each in scipy.spatial.KDTree(center).query_ball_point(place, reach)]
+        reach = 2 * np.sin(min(np.pi, REACH * np.sqrt(variance)) / 2)
+        near = [
+            np.unique(np.concatenate(texels)) for texels in scipy.spatial.KDTree(center).query_ball_point(place, reach)
+        ]
         index = np.zeros((len(place), max(map(len, near))), np.int32)
         known = np.zeros(index.shape)
-        for row, each in enumerate(near):
-            index[row, : len(each)], known[row, : len(each)] = each, area[each]
+        for row, texels in enumerate(near):
+            index[row, : len(texels)], known[row, : len(texels)] = texels, area[texels]
         away = 1 - np.einsum("toi,tmi->tom", place, center[index])
         weight = known[:, None] * np.exp(-concentration * away)
         weight /= weight.sum(-1, keepdims=True)
@@ -189,7 +191,7 @@ def _on_faces(size: int) -> Int[np.ndarray, "t 6"]:
     moved = np.swapaxes(np.asarray(cubemap.direction(size=size)).reshape(-1, 3) @ turn, 0, 1)
     count = len(moved)
     padded = np.pad(moved, ((0, -(-count // _BLOCK) * _BLOCK - count), (0, 0), (0, 0)), mode="edge")
-    blocks = [cubemap.project(*np.moveaxis(each, -1, 0)) for each in padded.reshape(-1, _BLOCK, 6, 3)]
-    face, s, t = (np.concatenate([np.asarray(each) for each in rows])[:count] for rows in zip(*blocks, strict=True))
+    blocks = [cubemap.project(*np.moveaxis(block, -1, 0)) for block in padded.reshape(-1, _BLOCK, 6, 3)]
+    face, s, t = (np.concatenate([np.asarray(part) for part in rows])[:count] for rows in zip(*blocks, strict=True))
     column, row = (np.clip((np.asarray(x) + 1) / 2 * size, 0, size - 1).astype(np.int32) for x in (s, t))
     return np.asarray(face, np.int32) * size * size + row * size + column

@@ -87,7 +87,7 @@ def start(
     tilt = jnp.einsum("vij,jl->vli", jnp.linalg.cholesky(square), radius * jnp.stack([jnp.cos(turn), jnp.sin(turn)]))
     drop = 2 * jnp.sum(near * away, 1)
     least = jnp.clip(_WIDEST * mixture.concentration_of(jnp.clip(drop, 1e-7, 0.8)), 1, FINEST / 2)
-    mean = _reflected(wo, tilt, _LOWEST)
+    mean = _reflect(wo, tilt, _LOWEST)
     wider = _RATIO ** -jnp.maximum(number + 1 - (lobes - lobes // _TAIL), 0)
     least = jnp.minimum(least[:, None], jnp.maximum(least[:, None] * wider, _BROADEST))
     concentration = 1.5 * least
@@ -164,20 +164,20 @@ def blend(
         member = scale.reshape(math.prod(nodes[:parameters]), -1)
         width = jnp.repeat(-jnp.mean(member, 1), len(wo) // len(member))[:, None, None]
         slope, scale = slope * jnp.exp(-width / 2), scale + width
-    every = jnp.concatenate([slope, scale, part], -1)
+    state = jnp.concatenate([slope, scale, part], -1)
     sure = part + 1e-4
-    count, every, sure = lobe.weight.shape[1], every.reshape(*nodes, -1, 4), sure.reshape(*nodes, -1, 1)
+    count, state, sure = lobe.weight.shape[1], state.reshape(*nodes, -1, 4), sure.reshape(*nodes, -1, 1)
     for axis in range(len(nodes)):
-        rim = [(1, 1) if i == axis else (0, 0) for i in range(every.ndim)]
-        e, s = jnp.pad(every * sure, rim, mode="edge"), jnp.pad(sure, rim, mode="edge")
-        low, own, high = ([jax.lax.slice_in_dim(x, k, k + nodes[axis], axis=axis) for x in (e, s)] for k in range(3))
-        top, sure = ((1 - smoothing) * b + smoothing / 2 * (a + c) for a, b, c in zip(low, own, high, strict=True))
-        every = top / sure
-    every = every.reshape(-1, count, 4)
-    slope, scale, part = every[..., :2], every[..., 2], every[..., 3]
+        rim = [(1, 1) if i == axis else (0, 0) for i in range(state.ndim)]
+        e, s = jnp.pad(state * sure, rim, mode="edge"), jnp.pad(sure, rim, mode="edge")
+        low, middle, high = ([jax.lax.slice_in_dim(x, k, k + nodes[axis], axis=axis) for x in (e, s)] for k in range(3))
+        top, sure = ((1 - smoothing) * b + smoothing / 2 * (a + c) for a, b, c in zip(low, middle, high, strict=True))
+        state = top / sure
+    state = state.reshape(-1, count, 4)
+    slope, scale, part = state[..., :2], state[..., 2], state[..., 3]
     if parameters:
         slope, scale = slope * jnp.exp(width / 2), jnp.minimum(scale - width[..., 0], math.log(FINEST))
-    return mixture.Mixture(part * total, _reflected(wo, slope, 0.0), jnp.exp(scale))
+    return mixture.Mixture(part * total, _reflect(wo, slope, 0.0), jnp.exp(scale))
 
 
 @jit
@@ -200,8 +200,8 @@ def weigh(
         above = jnp.append(jnp.where(lobe.concentration < _SHARP, wide, sharp), 1)
         start = jnp.concatenate([lobe.weight, weight])
         start, density = start + 1e-3 * jnp.mean(start), jnp.concatenate([density, fixed], 1)
-        found = jax.vmap(lambda m: mixture.weigh(density, m, start, steps=30)[0], in_axes=1)(mass)
-        return found * (jnp.sum(found, 1) / jnp.maximum(found @ above, _TINY))[:, None]
+        weight = jax.vmap(lambda m: mixture.weigh(density, m, start, steps=30)[0], in_axes=1)(mass)
+        return weight * (jnp.sum(weight, 1) / jnp.maximum(weight @ above, _TINY))[:, None]
 
     return jnp.moveaxis(jax.lax.map(one, (sample, mass, extent, lobe, fixed, weight)), 0, -1)
 
@@ -215,7 +215,7 @@ def _slope(half: Float[Array, "*b 3"]) -> Float[Array, "*b 2"]:
     return half[..., :2] / jnp.maximum(half[..., 2:], _GRAZING)
 
 
-def _reflected(wo: Float[Array, "v 3"], slope: Float[Array, "v l 2"], lowest: float) -> Float[Array, "v l 3"]:
+def _reflect(wo: Float[Array, "v 3"], slope: Float[Array, "v l 2"], lowest: float) -> Float[Array, "v l 3"]:
     """Directions whose half vectors with wo have the given slopes, raised to at least `lowest` in z."""
     normal = directions.normalize(jnp.concatenate([slope, jnp.ones_like(slope[..., :1])], -1))
     mean = 2 * jnp.sum(wo[:, None] * normal, -1, keepdims=True) * normal - wo[:, None]

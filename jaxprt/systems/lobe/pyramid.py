@@ -96,12 +96,12 @@ class LobeTransport(eqx.Module):
         # Split into separate programs: XLA vectorizes CPU code only without gathers, and recomputes a value for each
         # use. In blocks, what a few neighboring vertices read stays in the cache, and no array is transposed.
         count = face.shape[1]
-        face, s, t, spread = (_blocks(each) for each in (face, s, t, spread))
+        face, s, t, spread = (_blocks(array) for array in (face, s, t, spread))
         down, right, bit = _addresses(face, s, t, spread, size=self.size)
         corners = (np.arange(count, dtype=np.int32),) if points is None else points.corner
         read = tuple(_bytes(self.pyramid, _blocks(corner[None]), down, right) for corner in corners)
         weight = None if points is None else _blocks(points.weight.astype(spread.dtype))
-        seen, by_s, by_t = _decoded(read, weight, bit, s, t, spread, size=self.size)
+        seen, by_s, by_t = _decode(read, weight, bit, s, t, spread, size=self.size)
         return _columns(seen, count), _columns(by_s, count), _columns(by_t, count)
 
 
@@ -149,7 +149,7 @@ def _addresses(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> 
         right = [jnp.where(in_bits, x >> 2, y) for x, y in zip(second, column, strict=True)]
         address.append((jnp.stack(down, 1), jnp.stack(right, 1)))
         bit += [(x & 1) << 1 for x in first] + [((x & 2) << 1) + (x & 1) for x in second]
-    down, right = (jnp.stack(each, 1) for each in zip(*address, strict=True))
+    down, right = (jnp.stack(axis, 1) for axis in zip(*address, strict=True))
     return down, right, tuple(bit)
 
 
@@ -163,7 +163,7 @@ def _bytes(
 
 
 @partial(isolated, static=("size",))
-def _decoded(
+def _decode(
     read: tuple, corner_weight: Array | None, bit: tuple, s: Array, t: Array, spread: Array, *, size: int
 ) -> tuple[Array, Array, Array]:
     """Visibility and its derivatives with respect to s and t, from the 18 bytes of each corner."""
@@ -343,8 +343,8 @@ def precompute(
     job = _Job.make(mesh, occluder, vertex, size, apart=apart)
     result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress, label="visibility")
     position = visibility.rays.place(mesh, vertex)
-    made, vector, frame = (jax.device_put(each) for each in (result["pyramid"], result["vector"], job.frame))
-    return LobeTransport(made, vector, position, frame, size)
+    levels, vector, frame = (jax.device_put(array) for array in (result["pyramid"], result["vector"], job.frame))
+    return LobeTransport(levels, vector, position, frame, size)
 
 
 def compress(direct: StoredVisibility) -> LobeTransport:
@@ -364,8 +364,8 @@ def compress(direct: StoredVisibility) -> LobeTransport:
         seen = jax.device_put(direct.seen(part))
         pyramids.append(np.asarray(pyramid(seen)))
         vectors.append(np.asarray(diffuse.vectors(seen, direct.frame[part])))
-    made, vector = jax.device_put(np.concatenate(pyramids)), jax.device_put(np.concatenate(vectors, 1))
-    return LobeTransport(made, vector, direct.position, direct.frame, direct.size)
+    levels, vector = jax.device_put(np.concatenate(pyramids)), jax.device_put(np.concatenate(vectors, 1))
+    return LobeTransport(levels, vector, direct.position, direct.frame, direct.size)
 
 
 def bits(transport: LobeTransport) -> LobeTransport:
@@ -466,11 +466,11 @@ class _Job(visibility.rays.VisibilityJob):
         pyramids = np.array(pyramid(seen))
         if self.rays.blends:
             bits = 6 * self.size**2 // 8
-            pyramids[:, :bits] = np.asarray(pyramid(dithered(seen)))[:, :bits]
+            pyramids[:, :bits] = np.asarray(pyramid(dither(seen)))[:, :bits]
         return {"pyramid": pyramids, "vector": np.asarray(vector)}, count.rays
 
 
-def dithered(seen: UInt8[np.ndarray, "b d"]) -> UInt8[np.ndarray, "b d"]:
+def dither(seen: UInt8[np.ndarray, "b d"]) -> UInt8[np.ndarray, "b d"]:
     """Visibility of 0 or 16 sixteenths, whose mean over neighboring texels is that of `seen`, by ordered dithering.
 
     The finest level has one bit for each texel. Behind a translucent surface half-visible texels are no border between

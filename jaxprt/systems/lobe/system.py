@@ -106,7 +106,7 @@ class LobeSystem(protocol.VertexSystem):
         protocol.check_blend(materials)
         options = {"eye": eye, "points": self.points, "variance": variance}
         # The irradiance comes with the light: each row of points would hold a copy of the vectors.
-        transport = eqx.tree_at(lambda each: each.vector, self.transport, self.transport.vector[:0])
+        transport = eqx.tree_at(lambda stored: stored.vector, self.transport, self.transport.vector[:0])
         if materials is None:
             return view_lobes(transport, self.brdf, **options)
         materials.check(self.vertices, len(self.brdf.weight))
@@ -114,9 +114,9 @@ class LobeSystem(protocol.VertexSystem):
         # Channel by channel with the vertices last: an einsum would be a small matrix product for each vertex.
         channel = jnp.moveaxis(materials.weight, 0, 2)
         pairs = list(zip(seen.weight, seen.diffuse, channel, strict=True))
-        weight = reduce(jnp.add, (lobe * own[:, None] for lobe, _, own in pairs))
-        diffuse = reduce(jnp.add, (albedo * own for _, albedo, own in pairs))
-        return eqx.tree_at(lambda each: (each.weight, each.diffuse), seen, (weight, diffuse))
+        weight = reduce(jnp.add, (lobe * part[:, None] for lobe, _, part in pairs))
+        diffuse = reduce(jnp.add, (albedo * part for _, albedo, part in pairs))
+        return eqx.tree_at(lambda looked: (looked.weight, looked.diffuse), seen, (weight, diffuse))
 
     def combine(self, light: LobeLight, view: LobeView) -> Float[Array, "v c"]:
         """Radiance: the blurred light, read at the texels of the view and weighted."""
@@ -230,8 +230,8 @@ def _seen_part(visible, face, s, t, spread, concentration) -> tuple[Array, Array
     # In the tangent plane of the lobe's direction: on the plane of the face, long steps would depend on the face.
     by_s, by_t = along_s * reach, along_t * reach
     inward = (s * by_s + t * by_t) / (1 + s**2 + t**2)
-    own, moved = cubemap.unproject(face, s, t), cubemap.unproject(face, s + by_s, t + by_t)
-    face, s, t = cubemap.project(*(x - inward * y for x, y in zip(moved, own, strict=True)))
+    center, moved = cubemap.unproject(face, s, t), cubemap.unproject(face, s + by_s, t + by_t)
+    face, s, t = cubemap.project(*(x - inward * y for x, y in zip(moved, center, strict=True)))
     return seen, face, s, t, spread * (1 + across) / 2
 
 

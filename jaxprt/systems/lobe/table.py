@@ -106,7 +106,7 @@ class LobeBrdf(eqx.Module):
     @property
     def nbytes(self) -> int:
         """Bytes of the table."""
-        return sum(each.nbytes for each in (self.mean, self.scale, self.weight, self.diffuse))
+        return sum(array.nbytes for array in (self.mean, self.scale, self.weight, self.diffuse))
 
     def at(self, *parameter: Float[Array, ""]) -> "LobeBrdf":
         """The table at given values of its BRDF parameters, without their axes.
@@ -118,8 +118,8 @@ class LobeBrdf(eqx.Module):
             ValueError: The number of parameters differs from the table's.
         """
         if len(parameter) != len(self.knot):
-            given = f"{len(self.knot)} parameters, got {len(parameter)}"
-            raise ValueError(f"the table needs {given}; a system takes them in its materials, as `Blend.parameter`")
+            needed = f"{len(self.knot)} parameters, got {len(parameter)}"
+            raise ValueError(f"the table needs {needed}; a system takes them in its materials, as `Blend.parameter`")
         result = self
         for knot, value in zip(self.knot, parameter, strict=True):
             low, upper = grid.neighbors(grid.place(knot, value), size=len(knot))
@@ -152,17 +152,17 @@ class LobeBrdf(eqx.Module):
             spot = hemisphere.parabolic_coordinates(wo) * resolution - 0.5
             axis = [grid.neighbors(spot[:, i], size=resolution) for i in (1, 0)]
         nodes = self.scale.shape[1:]
-        rows = [each.reshape(-1, *nodes) for each in (self.mean, self.scale, self.weight, self.diffuse)]
+        rows = [array.reshape(-1, *nodes) for array in (self.mean, self.scale, self.weight, self.diffuse)]
         place = [
-            grid.neighbors(grid.place(knot, each), size=len(knot))
-            for knot, each in zip(self.knot, parameter, strict=True)
+            grid.neighbors(grid.place(knot, value), size=len(knot))
+            for knot, value in zip(self.knot, parameter, strict=True)
         ]
         if place:
             entry = _entries_between(jnp.concatenate(rows), place, axis, lobes=self.lobes)
             mean, scale, strength, diffuse = (jnp.moveaxis(column, 0, -1) for column in entry)
         else:
             value = grid.read(jnp.concatenate(rows), axis)
-            mean, scale, strength, diffuse = jnp.split(value, np.cumsum([len(each) for each in rows])[:-1])
+            mean, scale, strength, diffuse = jnp.split(value, np.cumsum([len(row) for row in rows])[:-1])
         x, y, z = mean.reshape(3, self.lobes, len(wo))
         if self.isotropic:
             cosine, sine = jnp.where(pole, 1, wo[:, 0] / sin_o), jnp.where(pole, 0, wo[:, 1] / sin_o)
@@ -251,18 +251,20 @@ def tabulate(
             f"got lobes={lobes}, error={error} and resolution={resolution}"
         )
     grid.check_family(brdf, knot)
-    knots = grid.checked(knot)
-    made = [grid.as_argument(brdf(*map(jnp.asarray, each)) if knots else brdf) for each in itertools.product(*knots)]
-    isotropic = all(is_isotropic(each) for each in made)
+    knots = grid.check_knots(knot)
+    models = [
+        grid.as_argument(brdf(*map(jnp.asarray, point)) if knots else brdf) for point in itertools.product(*knots)
+    ]
+    isotropic = all(is_isotropic(model) for model in models)
     points = itertools.product(*knots)
-    both = [_sampled(each, resolution, isotropic, point) for each, point in zip(made, points, strict=True)]
-    wo, samples = both[0][0], [each for _, each in both]
+    both = [_samples(model, resolution, isotropic, point) for model, point in zip(models, points, strict=True)]
+    wo, samples = both[0][0], [sample for _, sample in both]
     reached = np.inf
     for count in _COUNTS if lobes is None else (lobes,):
         tables = _tables(samples, wo, tuple(map(len, knots)), lobes=count)
-        result = _stacked(tables, knots, wo.shape[:-1])
+        result = _stack(tables, knots, wo.shape[:-1])
         reached = max(
-            float(_natural_error(b, _stacked([t], (), wo.shape[:-1]))) for b, t in zip(made, tables, strict=True)
+            float(_natural_error(b, _stack([t], (), wo.shape[:-1]))) for b, t in zip(models, tables, strict=True)
         )
         if error is None or reached <= error:
             return eqx.tree_at(lambda x: x.error, result, jnp.asarray(reached, wo.dtype))
@@ -278,36 +280,36 @@ def _check_options(lobes: int | None, error: float | None, resolution: int) -> N
     require.count("resolution", resolution, least=-1, most=1 << 12)
 
 
-def sampled(brdf: Callable, *, resolution: int) -> tuple[Float[Array, "*q 3"], tuple[Array, ...]]:
+def brdf_samples(brdf: Callable, *, resolution: int) -> tuple[Float[Array, "*q 3"], tuple[Array, ...]]:
     """Views at the nodes of a table, and samples of a BRDF for each; see `jaxprt.systems.lobe.em.samples`.
 
     Raises:
         ValueError: The BRDF returns values that are negative or not finite, or have no color axis.
     """
     brdf = grid.as_argument(brdf)
-    return _sampled(brdf, resolution, is_isotropic(brdf), ())
+    return _samples(brdf, resolution, is_isotropic(brdf), ())
 
 
-def _sampled(brdf: Callable, resolution: int, isotropic: bool, point: tuple) -> tuple[Array, tuple[Array, ...]]:
+def _samples(brdf: Callable, resolution: int, isotropic: bool, point: tuple) -> tuple[Array, tuple[Array, ...]]:
     wo = _nodes(resolution, isotropic)
     result = em.samples(brdf, wo.reshape(-1, 3))
     _check(result[0], result[1], wo.reshape(-1, 3), point)
     return jax.device_put(wo), result
 
 
-def _stacked(tables: list, knots: tuple, nodes: tuple[int, ...]) -> LobeBrdf:
+def _stack(tables: list, knots: tuple, nodes: tuple[int, ...]) -> LobeBrdf:
     """One table from those of all parameter values. Gray tables are repeated to the colors of the others."""
     size = tuple(map(len, knots))
     colors = max(len(table[2]) for table in tables)
 
     def stack(index: int, lead: int) -> Array:
-        every = [np.asarray(table[index]) for table in tables]
-        every = [np.broadcast_to(each, (colors, *each.shape[1:])) if index > 1 else each for each in every]
-        whole = np.stack(every, lead)
+        arrays = [np.asarray(table[index]) for table in tables]
+        arrays = [np.broadcast_to(array, (colors, *array.shape[1:])) if index > 1 else array for array in arrays]
+        whole = np.stack(arrays, lead)
         return jax.device_put(whole.reshape(*whole.shape[:lead], *size, *nodes))
 
     dtype = tables[0][0].dtype
-    knot = tuple(jnp.asarray(each, dtype) for each in knots)
+    knot = tuple(jnp.asarray(values, dtype) for values in knots)
     return LobeBrdf(stack(0, 2), stack(1, 1), stack(2, 2), stack(3, 1), knot, jnp.asarray(jnp.nan, dtype))
 
 
@@ -319,7 +321,7 @@ def _tables(samples: list[tuple[Array, ...]], wo: Array, size: tuple[int, ...], 
     """
     nodes, view = wo.shape[:-1], np.asarray(wo).reshape(-1, 3)
     state = [_begin(view, sample, mass, lobes=lobes) for sample, mass, _, _ in samples]
-    lobe, weight = [each[1] for each in state], [each[3] for each in state]
+    lobe, weight = [knot[1] for knot in state], [knot[3] for knot in state]
     for times, smoothing in _ROUNDS:
         for number, (sample, _, fixed, extent) in enumerate(samples):
             gray, _, least, _ = state[number]
@@ -328,24 +330,24 @@ def _tables(samples: list[tuple[Array, ...]], wo: Array, size: tuple[int, ...], 
                     sample, gray, extent, lobe[number], least, fixed, weight[number], steps=_STEPS
                 )
         if smoothing:
-            lobe = _blended(view, lobe, jnp.asarray(smoothing, wo.dtype), size, nodes)
+            lobe = _smooth(view, lobe, jnp.asarray(smoothing, wo.dtype), size, nodes)
     return [
         _end(one, em.weigh(sample, mass, extent, one, fixed, base), nodes=nodes)
         for one, base, (sample, mass, fixed, extent) in zip(lobe, weight, samples, strict=True)
     ]
 
 
-def _blended(
+def _smooth(
     view: np.ndarray, lobe: list[mixture.Mixture], smoothing: Array, size: tuple[int, ...], nodes: tuple[int, ...]
 ) -> list[mixture.Mixture]:
     """The lobes of all BRDFs, each moved towards its neighbors along the parameters and the view."""
     if not size:
         return [em.blend(view, lobe[0], smoothing, nodes=nodes)]
-    every = jax.tree.map(lambda *each: np.concatenate([np.asarray(x) for x in each]), *lobe)
+    stack = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(x) for x in leaves]), *lobe)
     views = np.tile(view, (len(lobe), 1))
-    every = em.blend(views, every, smoothing, nodes=(*size, *nodes), parameters=len(size))
-    split = [np.split(np.asarray(each), len(lobe)) for each in jax.tree.leaves(every)]
-    return [jax.tree.unflatten(jax.tree.structure(every), leaves) for leaves in zip(*split, strict=True)]
+    stack = em.blend(views, stack, smoothing, nodes=(*size, *nodes), parameters=len(size))
+    split = [np.split(np.asarray(leaf), len(lobe)) for leaf in jax.tree.leaves(stack)]
+    return [jax.tree.unflatten(jax.tree.structure(stack), leaves) for leaves in zip(*split, strict=True)]
 
 
 @partial(jit, static_argnames=("lobes",))

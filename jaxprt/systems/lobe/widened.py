@@ -79,7 +79,9 @@ def combine(
     assert isinstance(system, BrightTexels)
     assert light.seen is not None
     size, points = system.visibility.size, system.points
-    direction, area = (each(size=size).reshape(-1, 3)[light.texel] for each in (cubemap.direction, cubemap.vector_area))
+    direction, area = (
+        quantity(size=size).reshape(-1, 3)[light.texel] for quantity in (cubemap.direction, cubemap.vector_area)
+    )
     frame = jnp.moveaxis(seen.frame, 0, 2)
     # A texel is a lobe itself, as wide as it is.
     lobe = seen.lobe.widened(jnp.full(seen.frame.shape[0], 4 * jnp.pi / (6 * size**2 * 12), frame.dtype))

@@ -26,7 +26,7 @@ from jaxprt.decompose import eigen
 from jaxprt.files.arrays import Layout, Reference, reference, sketch
 from jaxprt.sphere import haar
 from jaxprt.systems.separable import sparse
-from jaxprt.systems.separable.factorization import SeparableBrdf, marked
+from jaxprt.systems.separable.factorization import SeparableBrdf, mark_of
 from jaxprt.visibility import StoredVisibility, members
 
 # Versions of the algorithms. A release that changes their results raises one.
@@ -111,7 +111,7 @@ class ClusteredTransport(eqx.Module):
             ValueError: The light has another number of coefficients than the transport.
         """
         require.length("the light's coefficients", coefficient, self.rms.shape[0])
-        return linear(_relit, _transposed, self, coefficient)
+        return linear(_relit, _transpose, self, coefficient)
 
 
 def _relit(transport: ClusteredTransport, coefficient: Array) -> Array:
@@ -125,24 +125,24 @@ def _relit(transport: ClusteredTransport, coefficient: Array) -> Array:
 
     def one(argument):
         mode, core, weight, light = argument
-        met = light.T @ mode.astype(dtype) @ core.reshape(modes, components * terms).astype(dtype)
-        component = jnp.moveaxis(met.reshape(-1, components, terms), 0, 2)
+        response = light.T @ mode.astype(dtype) @ core.reshape(modes, components * terms).astype(dtype)
+        component = jnp.moveaxis(response.reshape(-1, components, terms), 0, 2)
         return weight.astype(dtype) @ component.reshape(components, -1)
 
-    def written(result, at, found):
-        return result.at[at].set(found, mode="drop", unique_indices=True)
+    def write(result, at, value):
+        return result.at[at].set(value, mode="drop", unique_indices=True)
 
     start = jnp.zeros((count, terms * coefficient.shape[1]), dtype)
     clusters = (transport.mode, transport.core, transport.weight, light)
     result = jax.lax.platform_dependent(
         (at, clusters),
-        cpu=lambda each: jax.lax.scan(lambda out, row: (written(out, row[0], one(row[1])), None), start, each)[0],
-        default=lambda each: written(start, each[0], mapped(one, each[1])),
+        cpu=lambda rows: jax.lax.scan(lambda out, row: (write(out, row[0], one(row[1])), None), start, rows)[0],
+        default=lambda rows: write(start, rows[0], mapped(one, rows[1])),
     )
     return result.reshape(count, terms, -1)
 
 
-def _transposed(transport: ClusteredTransport, cotangent: Array) -> Array:
+def _transpose(transport: ClusteredTransport, cotangent: Array) -> Array:
     """Transpose of `_relit`, cluster by cluster. JAX's own would hold all modes and cores in full precision."""
     clusters, modes, components, terms = transport.core.shape
     dtype = cotangent.dtype
@@ -150,15 +150,15 @@ def _transposed(transport: ClusteredTransport, cotangent: Array) -> Array:
     def one(argument):
         mode, core, weight, at, read = argument
         component = (weight.astype(dtype).T @ jnp.where(read, cotangent[at], 0)).reshape(components, terms, -1)
-        met = core.reshape(modes, components * terms).astype(dtype) @ component.reshape(components * terms, -1)
-        return mode.astype(dtype) @ met
+        response = core.reshape(modes, components * terms).astype(dtype) @ component.reshape(components * terms, -1)
+        return mode.astype(dtype) @ response
 
     at = transport.vertex.reshape(clusters, -1)
     read = _read(transport).reshape(*at.shape, 1)
     cotangent = cotangent.reshape(len(cotangent), -1)
-    found = mapped(one, (transport.mode, transport.core, transport.weight, at, read))
-    start = jnp.zeros((len(transport.rms), found.shape[2]), dtype)
-    return start.at[transport.index.astype(jnp.int32)].add(found)
+    gradient = mapped(one, (transport.mode, transport.core, transport.weight, at, read))
+    start = jnp.zeros((len(transport.rms), gradient.shape[2]), dtype)
+    return start.at[transport.index.astype(jnp.int32)].add(gradient)
 
 
 def _read(transport: ClusteredTransport) -> Array:
@@ -243,7 +243,7 @@ def precompute(
     row, place = member.ravel(), members.places(member)
     rms = _rms(index, mode, core, weight, size=direct.texels)
     same = (direct.position, direct.frame, jax.device_put(row.astype(np.int32)), jax.device_put(place))
-    return ClusteredTransport(index, mode, core, weight, *same, rms, jax.device_put(marked(brdf.light_map)))
+    return ClusteredTransport(index, mode, core, weight, *same, rms, jax.device_put(mark_of(brdf.light_map)))
 
 
 @partial(jit, static_argnames=("components", "modes", "keep"))
@@ -282,10 +282,10 @@ def compress(
     sample = jax.lax.map(lambda a: jnp.sum(transport(a) ** 2, 1), (seen[::stride], frame[::stride]))
     _, index = jax.lax.top_k(jnp.sqrt(jnp.sum(sample, 0)) * importance, keep)
     importance = importance[index, None]
-    kept = jax.lax.map(lambda a: transport(a)[index] * importance, (seen, frame)).reshape(len(seen), -1)
-    value, vector = jnp.linalg.eigh(kept @ kept.T)
+    matrix = jax.lax.map(lambda a: transport(a)[index] * importance, (seen, frame)).reshape(len(seen), -1)
+    value, vector = jnp.linalg.eigh(matrix @ matrix.T)
     value, vector = jnp.maximum(value[::-1], 0), vector[:, ::-1][:, :components]
-    basis = jnp.moveaxis((vector.T @ kept).reshape(components, keep, -1), 0, 1).reshape(keep, -1)
+    basis = jnp.moveaxis((vector.T @ matrix).reshape(components, keep, -1), 0, 1).reshape(keep, -1)
     strength, mode, _ = eigen.left_singular(basis, terms=modes)
     core = mode.T @ basis
     mode = mode / importance
@@ -315,7 +315,7 @@ def _remainder(value: Array, total: Array) -> Array:
 def _rms(index: Array, mode: Array, core: Array, weight: Array, *, size: int) -> Array:
     def energy(argument):
         dtype = argument[2].dtype
-        mode, core, weight = (each.astype(dtype) for each in argument)
+        mode, core, weight = (array.astype(dtype) for array in argument)
         along = jnp.einsum("lnr,no,jor->lj", core, weight.T @ weight, core)
         return jnp.sum((mode @ along) * mode, 1)
 
@@ -342,13 +342,13 @@ class _Job(members.ClusterJob):
     def __getstate__(self) -> dict[str, Any]:
         """State for pickling. Memory-mapped visibility is pickled as the name of its file."""
         level = reference(self.direct.level)  # pyright: ignore[reportArgumentType]
-        return {**vars(self), "direct": eqx.tree_at(lambda each: each.level, self.direct, level)}
+        return {**vars(self), "direct": eqx.tree_at(lambda stored: stored.level, self.direct, level)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restores the state. Memory-mapped visibility is mapped again."""
         direct = state["direct"]
         if isinstance(direct.level, Reference):
-            direct = eqx.tree_at(lambda each: each.level, direct, direct.level.open(), is_leaf=_is_reference)
+            direct = eqx.tree_at(lambda stored: stored.level, direct, direct.level.open(), is_leaf=_is_reference)
         vars(self).update(state, direct=direct)
 
     @property
@@ -364,7 +364,7 @@ class _Job(members.ClusterJob):
     @property
     def near(self) -> Mapping[str, list[float]]:
         vertices = {"position": self.direct.position, "frame": self.direct.frame}
-        near = {name: sketch(each, tolerance=visibility.rays.ROUNDING) for name, each in vertices.items()}
+        near = {name: sketch(array, tolerance=visibility.rays.ROUNDING) for name, array in vertices.items()}
         return {**near, "direct": sketch(self.direct.level), "brdf": sketch(self.brdf.light_map)}
 
     @property

@@ -82,22 +82,22 @@ class SeparableBrdf(eqx.Module):
 
     def _read(self, texel: Array, direction: Array) -> Array:
         polar = self.coordinates is hemisphere.polar_coordinates
-        return _looked_up(jnp.moveaxis(texel, 0, 2), self.coordinates(direction), polar=polar)
+        return _look_up(jnp.moveaxis(texel, 0, 2), self.coordinates(direction), polar=polar)
 
 
 @partial(isolated, static=("polar",))
-def _looked_up(texel: Array, coordinates: Array, *, polar: bool) -> Array:
+def _look_up(texel: Array, coordinates: Array, *, polar: bool) -> Array:
     lookup = hemisphere.polar_lookup if polar else hemisphere.lookup
     if texel.shape[-1] == 1:  # With a trailing axis of 1, gradients with respect to coordinates take ten times as long.
-        return _looked_up(texel[..., 0], coordinates, polar=polar)[..., None]
+        return _look_up(texel[..., 0], coordinates, polar=polar)[..., None]
     *batch, axes = coordinates.shape
     if math.prod(batch) <= _BLOCK or not texel.size:  # An empty array cannot be divided into blocks.
         return lookup(texel, coordinates)
-    each = jax.checkpoint(lambda place: lookup(texel, place))
-    return jax.lax.map(each, coordinates.reshape(-1, axes), batch_size=_BLOCK).reshape(*batch, *texel.shape[2:])
+    look_up = jax.checkpoint(lambda place: lookup(texel, place))
+    return jax.lax.map(look_up, coordinates.reshape(-1, axes), batch_size=_BLOCK).reshape(*batch, *texel.shape[2:])
 
 
-def marked(light_map: Float[Array | np.ndarray, "r n n l"]) -> Float[np.ndarray, "r m"]:
+def mark_of(light_map: Float[Array | np.ndarray, "r n n l"]) -> Float[np.ndarray, "r m"]:
     """Samples of the light factors at a few texels, by which transport recognizes the BRDF it was made for."""
     edge = light_map.shape[1]
     row, column = (_MARKS * edge).astype(int)
@@ -111,7 +111,7 @@ def check_mark(known: Array | None, light_map: Array, *, name: str = "the BRDF")
     Nothing is checked if the samples are unknown, or inside a JAX transformation, where values are not known.
 
     Args:
-        known: Samples of the transport's light factors, from `marked`, or None.
+        known: Samples of the transport's light factors, from `mark_of`, or None.
         light_map: Light maps of the BRDF, for all terms of the transport or the first ones.
         name: Name of the BRDF in the error message.
 
@@ -120,9 +120,9 @@ def check_mark(known: Array | None, light_map: Array, *, name: str = "the BRDF")
     """
     if known is None or isinstance(known, Tracer) or isinstance(light_map, Tracer) or len(light_map) > len(known):
         return
-    expected, found = np.asarray(known)[: len(light_map)], marked(light_map)
-    same_colors = expected.shape == found.shape
-    distance, norm = float(np.linalg.norm(found - expected)) if same_colors else math.inf, np.linalg.norm(expected)
+    expected, actual = np.asarray(known)[: len(light_map)], mark_of(light_map)
+    same_colors = expected.shape == actual.shape
+    distance, norm = float(np.linalg.norm(actual - expected)) if same_colors else math.inf, np.linalg.norm(expected)
     if not distance <= _NEAR * norm:
         raise ValueError(
             f"{name} must be the one that the transport was made for, got another: its light factors differ from the "
@@ -181,8 +181,8 @@ def factor(
     if light is not None:
         if isinstance(light, Environment) or not isinstance(light, Sequence):
             raise TypeError(f"light must be a list of Environment, got {require.shown(light)}")
-        for each in light:
-            require.kind("each light", each, Environment, source="jaxprt.load_environment")
+        for environment in light:
+            require.kind("each light", environment, Environment, source="jaxprt.load_environment")
         return _factor_for(brdf, light, terms, error, resolution)
     _check_resolution(resolution)
     direction = np.asarray(hemisphere.parabolic_texel_direction(resolution=resolution)).reshape(-1, 3)
@@ -190,18 +190,18 @@ def factor(
     inside = np.flatnonzero(solid_angle)
     _check_terms(1 if terms is None else terms, inside.size)
     table = tabulate(brdf, jnp.asarray(direction))
-    flux, matrix, covariance = _weighted(table, direction, solid_angle, inside)
+    flux, matrix, covariance = _matrices(table, direction, solid_angle, inside)
     value, vector, remainder, terms = _leading(matrix, covariance, terms, error)
     light_map, view_map = _maps(table, solid_angle, flux, matrix, covariance, value, vector)
     # Fix the signs and the order of coinciding terms, so that transport from another machine fits the factors made
     # here.
     turn = eigen.orientation(np.asarray(value), np.asarray(vector))[:, :terms].T.astype(value.dtype)
-    light_map, view_map = _turned(turn, light_map, view_map, resolution=resolution)
+    light_map, view_map = _turn_maps(turn, light_map, view_map, resolution=resolution)
     return SeparableBrdf(light_map, view_map, jnp.asarray(remainder[terms - 1]), hemisphere.parabolic_coordinates)
 
 
 @jit
-def _weighted(table: Array, direction: Array, solid_angle: Array, inside: Array) -> tuple[Array, Array, Array]:
+def _matrices(table: Array, direction: Array, solid_angle: Array, inside: Array) -> tuple[Array, Array, Array]:
     """M diag(cos dw), the same with rows (view and color) weighted by the view's solid angle, and the covariance C."""
     flux = table[:, :, inside] * (direction[:, 2] * solid_angle)[inside]
     matrix = (flux * jnp.sqrt(solid_angle)[:, None]).reshape(-1, inside.size)
@@ -209,9 +209,9 @@ def _weighted(table: Array, direction: Array, solid_angle: Array, inside: Array)
 
 
 @partial(jit, static_argnames="resolution")
-def _turned(turn: Array, *value: Array, resolution: int) -> tuple[Array, ...]:
+def _turn_maps(turn: Array, *value: Array, resolution: int) -> tuple[Array, ...]:
     """Maps [r n n c] of the terms after the orthogonal transformation `turn` of the singular vectors."""
-    return tuple(jnp.tensordot(turn, each, 1).reshape(len(turn), resolution, resolution, -1) for each in value)
+    return tuple(jnp.tensordot(turn, maps, 1).reshape(len(turn), resolution, resolution, -1) for maps in value)
 
 
 @jit
@@ -239,13 +239,13 @@ def _factor_for(brdf: Callable, light: Sequence[Environment], terms: int | None,
         )
     count, most = 4, min(_MOST_TERMS, int(jnp.sum(hemisphere.parabolic_texel_area(resolution=resolution) > 0)))
     while True:
-        found = factor(brdf, terms=count, resolution=resolution)
-        reached = np.max([light_errors(brdf, found, each) for each in light], 0)
+        factored = factor(brdf, terms=count, resolution=resolution)
+        reached = np.max([light_errors(brdf, factored, environment) for environment in light], 0)
         good = np.flatnonzero(reached <= error)
         if good.size:
-            kept = found.truncate(int(good[0]) + 1)
-            number = jnp.asarray(reached[good[0]], found.error.dtype)
-            return SeparableBrdf(kept.light_map, kept.view_map, number, kept.coordinates)
+            shortest = factored.truncate(int(good[0]) + 1)
+            number = jnp.asarray(reached[good[0]], factored.error.dtype)
+            return SeparableBrdf(shortest.light_map, shortest.view_map, number, shortest.coordinates)
         if count == most:
             raise ValueError(f"error must be at least {reached[-1]:.3g}, which {count} terms reach; got {error}")
         count = min(4 * count, most)
@@ -287,22 +287,22 @@ def light_errors(
     """
     if light.radiance.ndim != 4:
         raise ValueError(f"the light must be one environment [6, n, n, c], got {list(light.radiance.shape)}")
-    return _light_errors(jax.tree_util.Partial(brdf), factored, light, _spread(frames, -1), _spread(views, 0))
+    return _light_errors(jax.tree_util.Partial(brdf), factored, light, _spiral(frames, -1), _spiral(views, 0))
 
 
 @jit
 def _light_errors(brdf: Callable, factored: Terms, light: Environment, normal: Array, view: Array) -> Array:
     size = light.radiance.shape[1]
-    direction, area = (each(size=size).reshape(-1, 3) for each in (cubemap.direction, cubemap.vector_area))
+    direction, area = (quantity(size=size).reshape(-1, 3) for quantity in (cubemap.direction, cubemap.vector_area))
     table = light.radiance.reshape(len(direction), -1)
     factor = factored.view(view)
 
     def one(axes):
         wi = directions.to_local(axes, direction)
         received = table * jnp.maximum(directions.to_local(axes, area)[:, 2:], 0)
-        met = jnp.einsum("drl,dc->rlc", factored.light(wi), received)
-        met = met[:, 0] if met.shape[1] == 1 else jnp.einsum("rcc->rc", met)
-        by_terms = jnp.cumsum(factor * met, 1)
+        response = jnp.einsum("drl,dc->rlc", factored.light(wi), received)
+        response = response[:, 0] if response.shape[1] == 1 else jnp.einsum("rcc->rc", response)
+        by_terms = jnp.cumsum(factor * response, 1)
 
         def exact(wo):
             return jnp.sum(brdf(wi, jnp.broadcast_to(wo, wi.shape)) * received, 0)
@@ -315,7 +315,7 @@ def _light_errors(brdf: Callable, factored: Terms, light: Environment, normal: A
     return jnp.sqrt(jnp.sum(error, 0) / jnp.where(whole > 0, whole, 1))
 
 
-def _spread(count: int, lowest: int) -> Array:
+def _spiral(count: int, lowest: int) -> Array:
     """Directions with z above `lowest`, spread evenly on a golden spiral."""
     height = 1 - (1 - lowest) * (np.arange(count) + 0.5) / count
     turn = np.pi * (1 + np.sqrt(5)) * np.arange(count)

@@ -21,7 +21,7 @@ from jaxprt.compile import jit, linear, total
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar
-from jaxprt.systems.separable.factorization import SeparableBrdf, marked
+from jaxprt.systems.separable.factorization import SeparableBrdf, mark_of
 from jaxprt.visibility.rays import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
@@ -84,8 +84,8 @@ class SparseTransport(eqx.Module):
         # Sorted by row, so that values read together are contiguous in memory.
         rows, colors = self.index[0].size, self.value.shape[3]
         value = np.asarray(self.value).reshape(-1, rows, colors).swapaxes(0, 1)
-        kept = np.any(value != 0, -1)
-        number = np.asarray(self.index).reshape(-1, rows).T[kept]
+        nonzero = np.any(value != 0, -1)
+        number = np.asarray(self.index).reshape(-1, rows).T[nonzero]
         order = np.argsort(number, kind="stable")
         count = np.bincount(number, minlength=len(self.rms))
         length = max(1, len(number) // (_CHUNKS * max(1, np.count_nonzero(count))))
@@ -95,10 +95,10 @@ class SparseTransport(eqx.Module):
         chunk = np.repeat(np.arange(len(count)), chunks)
         padded = np.zeros((len(chunk) * length, colors), value.dtype)
         row = np.zeros(len(padded), np.int32)
-        padded[place], row[place] = value[kept][order], np.nonzero(kept)[0][order]
+        padded[place], row[place] = value[nonzero][order], np.nonzero(nonzero)[0][order]
         row, padded = row.reshape(-1, length).T, padded.reshape(-1, length, colors).swapaxes(0, 1)
-        found = Transpose(jnp.asarray(row), jnp.asarray(padded), jnp.asarray(chunk, jnp.int32))
-        return eqx.tree_at(lambda x: x.transpose, self, found, is_leaf=lambda x: x is None)
+        transpose = Transpose(jnp.asarray(row), jnp.asarray(padded), jnp.asarray(chunk, jnp.int32))
+        return eqx.tree_at(lambda x: x.transpose, self, transpose, is_leaf=lambda x: x is None)
 
     @jit
     def apply(self, coefficient: Float[Array, "b c"]) -> Float[Array, "v r _"]:
@@ -128,22 +128,22 @@ class SparseTransport(eqx.Module):
     @property
     def nbytes(self) -> int:
         """Bytes of indices and values, and of the transpose if there is one."""
-        return self.index.nbytes + self.value.nbytes + sum(each.nbytes for each in jax.tree.leaves(self.transpose))
+        return self.index.nbytes + self.value.nbytes + sum(array.nbytes for array in jax.tree.leaves(self.transpose))
 
 
 def _gather(transport: SparseTransport, coefficient: Array) -> Array:
     """`apply`. The axis of kept coefficients comes first, so that each step reads contiguous rows of all vertices."""
-    kept, vertices, terms = transport.index.shape
-    rows = transport.index.reshape(kept, -1), transport.value.reshape(kept, vertices * terms, -1)
+    keep, vertices, terms = transport.index.shape
+    rows = transport.index.reshape(keep, -1), transport.value.reshape(keep, vertices * terms, -1)
     return _accumulate(*rows, coefficient).reshape(vertices, terms, -1)
 
 
 def _scatter(transport: SparseTransport, cotangent: Array) -> Array:
     assert transport.transpose is not None
-    each = transport.transpose
-    chunk = _accumulate(each.row, each.value, cotangent.reshape(-1, cotangent.shape[-1]))
+    transpose = transport.transpose
+    chunk = _accumulate(transpose.row, transpose.value, cotangent.reshape(-1, cotangent.shape[-1]))
     start = jnp.zeros((len(transport.rms), chunk.shape[1]), chunk.dtype)
-    return start.at[each.number].add(chunk, indices_are_sorted=True)
+    return start.at[transpose.number].add(chunk, indices_are_sorted=True)
 
 
 def _accumulate(index: Shaped[Array, "k n"], value: Float[Array, "k n l"], table: Float[Array, "m c"]) -> Array:
@@ -194,8 +194,8 @@ def largest(
 def rms(index: Array | np.ndarray, value: Array | np.ndarray, size: int) -> Array:
     """Root mean square over vertices, terms and colors of each of `size` coefficients; those not kept count as zero."""
     total = np.zeros(size)
-    for number, kept in zip(np.asarray(index), np.asarray(value), strict=True):
-        total += np.bincount(number.ravel(), np.mean(kept**2, -1).ravel(), size)
+    for number, row in zip(np.asarray(index), np.asarray(value), strict=True):
+        total += np.bincount(number.ravel(), np.mean(row**2, -1).ravel(), size)
     return jnp.asarray(np.sqrt(total / max(1, np.prod(index.shape[1:]))), jnp.result_type(float))
 
 
@@ -250,7 +250,7 @@ def precompute(
     share = rms(result["index"], result["value"], 6 * size * size)
     index, value = jax.device_put(result["index"]), jax.device_put(result["value"])
     position, frame = visibility.rays.place(mesh, vertex), jax.device_put(job.frame)
-    return SparseTransport(index, value, position, frame, share, mark=jax.device_put(marked(brdf.light_map)))
+    return SparseTransport(index, value, position, frame, share, mark=jax.device_put(mark_of(brdf.light_map)))
 
 
 @jit

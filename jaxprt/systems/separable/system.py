@@ -24,7 +24,7 @@ class Transport(Protocol):
         position: Vertex positions in world units, in the order of the mesh.
         frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
         rms: Root mean square of the transport over vertices and terms, for each wavelet coefficient.
-        mark: Samples of the BRDF's light factors, from `factorization.marked`; None if unknown.
+        mark: Samples of the BRDF's light factors, from `factorization.mark_of`; None if unknown.
     """
 
     position: Float[Array, "v 3"]
@@ -183,7 +183,7 @@ def _product(light: Array, view: Array) -> Array:
 def _(primal, tangent):
     light, view = primal
     parts = [
-        linear(_sum, _spread_gray if x.shape[2] < fixed.shape[2] else _spread, fixed, x)
+        linear(_sum, _outer_gray if x.shape[2] < fixed.shape[2] else _outer, fixed, x)
         for fixed, x in ((view, tangent[0]), (light, tangent[1]))
     ]
     return _sum(light, view), parts[0] + parts[1]
@@ -194,12 +194,12 @@ def _sum(fixed: Array, x: Array) -> Array:
     return reduce(jnp.add, (fixed[:, term] * x[:, term] for term in range(fixed.shape[1])))
 
 
-def _spread(fixed: Array, cotangent: Array) -> Array:
+def _outer(fixed: Array, cotangent: Array) -> Array:
     """Transpose of `_sum`. JAX's own transpose pads every term."""
     return fixed * cotangent[:, None]
 
 
-def _spread_gray(fixed: Array, cotangent: Array) -> Array:
-    """`_spread` for a gray factor beside a colored one: sums over colors, written out for the same reason as `_sum`."""
+def _outer_gray(fixed: Array, cotangent: Array) -> Array:
+    """`_outer` for a gray factor beside a colored one: sums over colors, written out for the same reason as `_sum`."""
     colors = range(cotangent.shape[1])
     return reduce(jnp.add, (fixed[..., c] * cotangent[:, None, c] for c in colors))[..., None]

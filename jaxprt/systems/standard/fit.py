@@ -22,7 +22,7 @@ from jaxprt.sphere import hemisphere
 from jaxprt.systems import bounces, bright_texels, dynamic, harmonic, lobe
 from jaxprt.systems.bounces import traced
 from jaxprt.systems.lobe import LobeBrdf, em
-from jaxprt.systems.lobe.table import measured_error, sampled
+from jaxprt.systems.lobe.table import brdf_samples, measured_error
 from jaxprt.systems.standard import descent, tables
 from jaxprt.systems.standard.families import RoughnessFamily, SheenFamily, ShininessFamily, SlopeFamily
 
@@ -126,7 +126,7 @@ def lobes(made: Material, count: int) -> dict[str, np.ndarray]:
 
 def _least(brdf: Channels, count: int) -> np.ndarray:
     """Bounds of the concentrations of lobes in EM."""
-    wo, (sample, mass, _, _) = sampled(brdf, resolution=32)
+    wo, (sample, mass, _, _) = brdf_samples(brdf, resolution=32)
     return np.asarray(em.start(wo, sample, jnp.sum(mass, -1), lobes=count)[1]).T
 
 

@@ -74,9 +74,9 @@ def test_matrices_of_the_tool_map_its_light_to_its_light(tmp_path, close):
     """In the file the rows of a vertex meet light in the tool's coefficients, and give it in the vertex's frame."""
     made, light = matrices(), RNG.normal(size=9).astype(np.float32)
     harmonic.export_transfer(tmp_path / "m.npy", made, MESH, convention=OTHER)
-    theirs = np.load(tmp_path / "m.npy")[:, 0] @ OTHER.written(light)
+    theirs = np.load(tmp_path / "m.npy")[:, 0] @ OTHER.write(light)
     arriving = np.einsum("voi,i->vo", np.asarray(made.matrix)[:, 0], light)
-    close(theirs, OTHER.written(arriving, axis=1, world=False))
+    close(theirs, OTHER.write(arriving, axis=1, world=False))
 
 
 def test_a_ply_file_has_named_properties_in_the_tools_axes(tmp_path):

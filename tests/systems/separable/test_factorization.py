@@ -163,8 +163,8 @@ def test_factoring_again_with_other_rounding_finds_the_same_factors_in_the_same_
         lambda wi, wo: brdf(wi, wo) * (1 + 1e-6 * jnp.sin(1e4 * wi[..., :1])), terms=5, resolution=12
     )
     assert jnp.linalg.norm(again.light_map - first.light_map) < 1e-3 * jnp.linalg.norm(first.light_map)
-    separable.factorization.check_mark(jnp.asarray(separable.factorization.marked(first.light_map)), again.light_map)
+    separable.factorization.check_mark(jnp.asarray(separable.factorization.mark_of(first.light_map)), again.light_map)
     with pytest.raises(ValueError, match="the ball must be the one that the transport was made for, got another"):
         separable.factorization.check_mark(
-            jnp.asarray(separable.factorization.marked(first.light_map)), 1.01 * again.light_map, name="the ball"
+            jnp.asarray(separable.factorization.mark_of(first.light_map)), 1.01 * again.light_map, name="the ball"
         )

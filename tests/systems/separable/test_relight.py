@@ -12,7 +12,7 @@ from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.scene import Environment
 from jaxprt.scene.environment import rotate
 from jaxprt.systems.separable import SparseTransport, factor, precompute
-from jaxprt.systems.separable.factorization import marked
+from jaxprt.systems.separable.factorization import mark_of
 from jaxprt.systems.separable.sparse import compress
 
 SIZE = 8
@@ -161,7 +161,7 @@ def test_a_quarter_turn_of_everything_changes_nothing(brdf, random, close):
 
 def test_transport_refuses_factors_that_it_was_not_made_of_wherever_values_are_known(transport, factored, random):
     known = eqx.tree_at(
-        lambda t: t.mark, transport, jnp.asarray(marked(factored.light_map)), is_leaf=lambda x: x is None
+        lambda t: t.mark, transport, jnp.asarray(mark_of(factored.light_map)), is_leaf=lambda x: x is None
     )
     light = some_light(random)
     expected = relight(transport, factored, light)
