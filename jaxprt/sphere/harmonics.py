@@ -360,7 +360,7 @@ def least_laplacian(coefficient: Float[Array, "lm *c"], share: Float[Array, ""])
     Reference: Sloan 2008, "Stupid spherical harmonics tricks", section on windowing.
     """
     if not isinstance(share, Tracer) and not 0 <= np.asarray(share) <= 1:
-        raise ValueError(f"share, of the squared Laplacian that remains, must be from 0 to 1, got {share}")
+        raise ValueError(f"the share of the squared Laplacian that remains must be from 0 to 1, got {share}")
     return _least_laplacian(coefficient, share)
 
 

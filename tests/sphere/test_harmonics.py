@@ -302,7 +302,7 @@ def test_a_share_of_zero_keeps_the_mean_alone_and_shares_out_of_range_are_refuse
     factor = harmonics.least_laplacian(normal(17, 25, 3), jnp.array(0.0))
     np.testing.assert_array_equal(factor, [1, 0, 0, 0, 0])
     for kept in (-0.1, 1.5, np.nan):
-        with pytest.raises(ValueError, match="share of the squared Laplacian that remains, must be from 0 to 1, got"):
+        with pytest.raises(ValueError, match="share of the squared Laplacian that remains must be from 0 to 1, got"):
             harmonics.least_laplacian(normal(17, 25, 3), jnp.array(kept))
 
 
