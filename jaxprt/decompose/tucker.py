@@ -141,7 +141,7 @@ def _square(matrix: Array) -> Array:
     rest = matrix[:, count * _BLOCK :]
 
     def add(total, start):
-        columns = jax.lax.dynamic_blockin_dim(matrix, start, _BLOCK, 1)
+        columns = jax.lax.dynamic_slice_in_dim(matrix, start, _BLOCK, 1)
         return total + columns @ columns.T, None
 
     return jax.lax.scan(add, rest @ rest.T, _BLOCK * jnp.arange(count))[0] if count else rest @ rest.T
