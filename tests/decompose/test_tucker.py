@@ -170,3 +170,8 @@ def test_sweeps_never_raise_the_error_and_tell_it(x64):
 def test_a_negative_number_of_sweeps_is_refused():
     with pytest.raises(ValueError, match="sweeps must not be negative, got -1"):
         hooi(jnp.ones((3, 4)), ranks=(1, 1), sweeps=-1)
+
+
+def test_gram_matrices_of_wide_matrices_are_summed_over_blocks_of_columns(close):
+    matrix = np.random.default_rng(6).standard_normal((3, 2 * 4096 + 5)).astype(np.float32)
+    close(tucker.gram(jnp.asarray(matrix), mode=0), matrix.astype(float) @ matrix.T.astype(float))
