@@ -175,7 +175,7 @@ def tabulate(
     if ranks is None:
         assert table is not None
         return without_tensor(table)
-    knots, size = grid.checked(knot), [len(values) for values in knot]
+    knots, size = grid.check_knots(knot), [len(values) for values in knot]
     places = np.stack(np.meshgrid(*knots, indexing="ij"), -1).reshape(-1, len(knots)) if knots else ()
     members = [brdf(*map(jnp.asarray, place)) for place in places] if knots else [brdf]
     flat = None if table is None else _flat(table, len(members))
@@ -259,7 +259,7 @@ def _decomposed(rest: Reflected, ranks: tuple[int, int, int]) -> tuple[Array, ..
     inside = np.flatnonzero(np.asarray(rest.area))
     flat, seen = _weighted(rest.tensor, jnp.sqrt(rest.area), inside)
     least = tuple(min(rank, size) for rank, size in zip(ranks, seen.shape, strict=True))
-    return _maps(tucker.oriented(tucker.truncated(seen, ranks=least)), flat, seen, rest, inside)
+    return _maps(tucker.orient(tucker.truncated(seen, ranks=least)), flat, seen, rest, inside)
 
 
 @jit
