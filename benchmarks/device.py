@@ -139,11 +139,11 @@ class Maker:
         """One region, whose BRDFs have lobes and two terms."""
         maps = self.normal(2, 32, 32), self.normal(2, 32, 32)
         cores = self.normal(2, 2, 2), self.normal(3, 1, 2)
-        brdf = dynamic.DynamicBrdf(*cores, *maps, self.lobes(3), None, jnp.asarray(0.0))
+        brdf = dynamic.BrdfSet(*cores, *maps, self.lobes(3), None, jnp.asarray(0.0))
         row = jnp.arange(vertices, dtype=jnp.int32)
         region = dynamic.RegionTransport(self.clusters(vertices, 3), self.pyramids(vertices, diffuse=False), row)
         material = dynamic.Material(np.array([0.2, 0.3, 0.5]), self.uniform(3), self.uniform(vertices, 3))
-        return dynamic.DynamicSystem(dynamic.DynamicTransport((region,), row), (brdf,)), [material]
+        return dynamic.SetSystem(dynamic.SetTransport((region,), row), (brdf,)), [material]
 
     def bounces(self, vertices: int) -> tuple[System, Any]:
         """One and two bounces of that region."""

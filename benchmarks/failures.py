@@ -149,7 +149,7 @@ def changing(sizes: Sizes) -> Pictures:
     for name, (low, high) in {"m .035 and .56": (0.035, 0.56), "m .1 and .196": (0.1, 0.196)}.items():
         family = navigation.cook_torrance(point=np.array([(f0, m) for f0 in (0.0, 1.0) for m in (low, high)]))
         members = dynamic.factor(family.brdf, dynamic.separate(family.brdf, lobes=8))
-        system = dynamic.DynamicSystem(dynamic.precompute(mesh, [members], progress=False), (members,))
+        system = dynamic.SetSystem(dynamic.precompute_sets(mesh, [members], progress=False), (members,))
         material = [dynamic.Material(family.navigation.weight(place), diffuse=0.0, specular=1.0)]
         color = radiance(system, light, eye=camera.eye, materials=material)
         mine[name] = (lambda color=color: image.render(mesh, color, camera)), memory(system)

@@ -32,7 +32,7 @@ from jaxprt.brdf import AshikhminShirley
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import directions
 from jaxprt.systems.bounces import SecondBounce, TransferTensor
-from jaxprt.systems.dynamic import DynamicTransport, Material, RegionTransport
+from jaxprt.systems.dynamic import Material, RegionTransport, SetTransport
 from jaxprt.systems.harmonic import TransferMatrix
 from jaxprt.systems.lobe import LobeTransport
 from jaxprt.systems.separable import ClusteredTransport, SeparableBrdf
@@ -258,11 +258,11 @@ def _seen(vertices: int) -> LobeTransport:
     return LobeTransport(jnp.asarray(pyramid), jnp.asarray(vector), position, frame, SIZE)
 
 
-def _region(vertices: int) -> DynamicTransport:
+def _region(vertices: int) -> SetTransport:
     terms = _clustered(vertices, terms=1, components=24, modes=24, keep=1024)
     row = jnp.arange(vertices)
     seen = eqx.tree_at(lambda x: x.vector, _seen(vertices), jnp.zeros((0, vertices), jnp.uint8))
-    return DynamicTransport((RegionTransport(terms, seen, row),), row)
+    return SetTransport((RegionTransport(terms, seen, row),), row)
 
 
 def _bounces(vertices: int, factor: jax.Array) -> TransferTensor:

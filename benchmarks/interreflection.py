@@ -69,7 +69,7 @@ class Scene(NamedTuple):
     """What is relit."""
 
     mesh: Mesh
-    transport: dynamic.DynamicTransport
+    transport: dynamic.SetTransport
     tensor: bounces.TransferTensor
     brdfs: list
     triples: list[Triple]
@@ -117,7 +117,7 @@ def measure_scene(published: Published, members, along, plane, quick: bool, stor
     mesh = join([glossy, ground_plane(glossy, vertices=published.ground if real else 100)])
     size = 64 if real else 16
     path = store and store / published.mesh
-    transport = dynamic.precompute(mesh, [members] * 2, size=size, path=path and path / "direct", progress=False)
+    transport = dynamic.precompute_sets(mesh, [members] * 2, size=size, path=path and path / "direct", progress=False)
     start = time.perf_counter()
     longest = (8, 8) if quick else LONGEST
     options: dict = {"components": longest[0], "modes": longest[1], "edge": 8 if real else 4, "size": 16 if real else 8}

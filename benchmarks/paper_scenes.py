@@ -141,12 +141,12 @@ def prepare(name: str, *, quick: bool = False, store: pathlib.Path | None = None
     start = time.perf_counter()
     try:
         path = folder and folder / f"direct{size}"
-        transport = dynamic.precompute(mesh, regions, size=size, path=path, progress=False)
+        transport = dynamic.precompute_sets(mesh, regions, size=size, path=path, progress=False)
         tensor = bounces.precompute(mesh, paths, path=folder and folder / marks, progress=False, **given)
     finally:
         kept = folder and folder / f"{marks}_bounces{given['bounces']}.json"
         seconds, peak = _spent(kept, time.perf_counter() - start)
-    direct = dynamic.DynamicSystem(transport, regions, samples=1 if quick else 2)
+    direct = dynamic.SetSystem(transport, regions, samples=1 if quick else 2)
     system = prt.total(direct, bounces.BouncesSystem(tensor, direct))
     return Made(name, recipe, mesh, system, family.navigation, seconds, peak)
 
@@ -166,7 +166,7 @@ def _spent(path: pathlib.Path | None, seconds: float) -> tuple[float, int]:
     return found["seconds"], found["peak"]
 
 
-def sets(space: str, *, quick: bool, sharp: bool) -> tuple[dynamic.DynamicBrdf, dynamic.DynamicBrdf, navigation.Family]:
+def sets(space: str, *, quick: bool, sharp: bool) -> tuple[dynamic.BrdfSet, dynamic.BrdfSet, navigation.Family]:
     """What is seen of a set of BRDFs, by lobes, what light meets on its way, by terms, and the way through the set.
 
     Usual light paths have 16 terms and views smoothed to degree 5. Sharp ones, for caustics, have a tensor of the

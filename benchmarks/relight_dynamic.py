@@ -109,7 +109,7 @@ def measure_scene(scene: Published, sets: list, fitted: list, plane, quick: bool
     # One for any number of lobes.
     both = [sets[0], sets[0] if scene.adjustable == 2 else fixed]
     path = store and store / scene.mesh
-    transport = dynamic.precompute(mesh, both, size=size, path=path, progress=False)
+    transport = dynamic.precompute_sets(mesh, both, size=size, path=path, progress=False)
     seconds = time.perf_counter() - start
     triples = draw(glossy, size, quick)
     for members, took in zip(sets, fitted, strict=True):

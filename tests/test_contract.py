@@ -202,18 +202,18 @@ HOST = {
     "brdf.navigation.cook_torrance": "reads a file",
     "systems.dynamic.table.tabulate": "checks values",
     "systems.dynamic.table.without_tensor": "empty arrays",
-    "systems.dynamic.vertices.precompute": "traces rays",
-    "systems.dynamic.vertices.compress": "runs workers and writes files",
-    "systems.dynamic.vertices.clustering": "counts",
     "systems.dynamic.transport.precompute": "traces rays",
     "systems.dynamic.transport.compress": "runs workers and writes files",
-    "systems.dynamic.relight.check_material": "checks values",
-    "systems.dynamic.relight.light_side": "gives indices; dynamic.radiance has them all",
-    "systems.dynamic.relight.view_side": "the same",
-    "systems.dynamic.relight.mix": "the same",
+    "systems.dynamic.transport.clustering": "counts",
+    "systems.dynamic.set_transport.precompute_sets": "traces rays",
+    "systems.dynamic.set_transport.compress": "runs workers and writes files",
+    "systems.dynamic.set_relight.check_material": "checks values",
+    "systems.dynamic.set_relight.light_side": "gives indices; dynamic.radiance has them all",
+    "systems.dynamic.set_relight.view_side": "the same",
+    "systems.dynamic.set_relight.mix": "the same",
     "systems.devices": "puts arrays on devices",
     "systems.protocol": "calls the methods of systems; tests/systems/test_protocol.py holds these",
-    "systems.dynamic.relight.combine": "takes indices; the same",
+    "systems.dynamic.set_relight.combine": "takes indices; the same",
     "systems.bounces.relight.light_side": "takes half precision; bounces.radiance has them all",
     "systems.bounces.relight.arriving": "takes indices; the same",
     "systems.bounces.relight.view_side": "takes indices; the same",
@@ -385,13 +385,13 @@ class Draw:
             self.uniform(),
         )
         maps = self.normal(2, 4, 4), self.normal(2, 4, 4)
-        return dynamic.DynamicBrdf(self.normal(2, 2, 2), self.normal(count, 1, 2), *maps, lobe, None, self.uniform())
+        return dynamic.BrdfSet(self.normal(2, 2, 2), self.normal(count, 1, 2), *maps, lobe, None, self.uniform())
 
     def tensor(self):
         """A BRDF with lobes and terms."""
         lobe, maps = self.lobes(), (self.normal(2, 4, 4), self.normal(3, 4, 4))
         factor = self.normal(len(lobe.weight), 2)
-        return dynamic.table.DynamicBrdf(lobe, self.normal(2, 2, 3), factor, *maps, self.uniform())
+        return dynamic.DynamicBrdf(lobe, self.normal(2, 2, 3), factor, *maps, self.uniform())
 
     def regions(self, size=8, vertices=3):
         """Transport of one region for ``changing`` and ``light``."""
@@ -412,7 +412,7 @@ class Draw:
         # Stored in half precision; here in the one under test.
         both = self.normal(1, 5, 4), self.normal(1, 4, 2, 3)
         terms = eqx.tree_at(lambda each: (each.mode, each.core), terms, both)
-        return dynamic.DynamicTransport((dynamic.RegionTransport(terms, small, row),), row)
+        return dynamic.SetTransport((dynamic.RegionTransport(terms, small, row),), row)
 
     def material(self, vertices=3):
         """What ``regions`` is made of; the color of its lobes is a texture."""
@@ -731,8 +731,8 @@ EXAMPLES = {
         lambda draw: call(draw.changing().at(draw.uniform(2)), draw.upper(5), draw.upper(5)),
     ),
     "systems.dynamic.table.DynamicBrdf": example(lambda draw: call(draw.tensor(), draw.upper(5), draw.upper(5))),
-    "systems.dynamic.vertices.light_factors": example(lambda draw: call(draw.tensor())),
-    "systems.dynamic.transport.light_factors": example(lambda draw: call(draw.changing())),
+    "systems.dynamic.transport.light_factors": example(lambda draw: call(draw.tensor())),
+    "systems.dynamic.set_transport.light_factors": example(lambda draw: call(draw.changing())),
     "systems.bounces.functions.weights": example(
         lambda draw: call(draw.normal(2, 1, 2), draw.uniform(2), draw.uniform(3), draw.uniform(1)),
     ),
@@ -861,7 +861,7 @@ EXAMPLES = {
         # Frames have derivatives along rotations only; see sphere.rotation.
         gradient=("brdf", "excess", "eye"),
     ),
-    "systems.dynamic.relight.radiance": example(
+    "systems.dynamic.set_relight.radiance": example(
         lambda draw: call(
             each := draw.regions(),
             (draw.changing(),),

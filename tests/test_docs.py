@@ -129,7 +129,8 @@ def small(coarse: None, bound) -> Iterator[None]:
 
 def _with_size() -> list:
     systems = [prt.harmonic.precompute, prt.harmonic.precompute_diffuse, prt.lobe.precompute, prt.dynamic.precompute]
-    systems += [prt.separable.precompute, prt.bounces.precompute, prt.visibility.precompute, prt.precompute]
+    systems += [prt.dynamic.precompute_sets, prt.separable.precompute, prt.bounces.precompute]
+    systems += [prt.visibility.precompute, prt.precompute]
     return [*systems, prt.load_environment, prt.scene.builtin.daylight, prt.scene.builtin.studio]
 
 

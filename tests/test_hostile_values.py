@@ -234,7 +234,7 @@ def constructors() -> dict[str, Verb]:
 
 def _material(**given: Any) -> Any:
     """A material that a region uses."""
-    prt.dynamic.relight.check_material(0, prt.dynamic.Material(**given), 1, 12)
+    prt.dynamic.set_relight.check_material(0, prt.dynamic.Material(**given), 1, 12)
 
 
 def _pictured(**given: Any) -> Any:

@@ -18,7 +18,7 @@ from jaxprt.systems.separable.factorization import tabulate
 
 def factor_tensor(
     brdfs: Sequence[Callable], *, ranks: tuple[int, int, int] = (4, 8, 8), resolution: int = 48
-) -> brdf_set.DynamicBrdf:
+) -> brdf_set.BrdfSet:
     """Decomposes a set of BRDFs, sampled at the texels of the orthographic disk.
 
     The result is optimal in the Frobenius norm over the disk. This norm is dominated by the largest values, in sharp

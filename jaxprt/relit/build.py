@@ -57,8 +57,8 @@ def precompute(
 
     Args:
         scene: Scene from `jaxprt.load_scene`, or built from `jaxprt.Part`.
-        system: Name of a system ("lobe", "harmonic" or "separable"), or a recipe with its own parameters, such as
-            `jaxprt.relit.Lobes(lobes=8)`, or a dictionary from the name of each part to one of these. If None,
+        system: Name of a system ("lobe", "dynamic", "harmonic" or "separable"), or a recipe with its own parameters,
+            such as `jaxprt.relit.Lobes(lobes=8)`, or a dictionary from the name of each part to one of these. If None,
             `jaxprt.plan` chooses the system with the fewest bytes that meets `error`, for each kind of material.
         error: Largest relative L2 error of the radiance of each part. Only used by the plan. If None, 0.05, or the
             smallest error that can be reached, with a warning.

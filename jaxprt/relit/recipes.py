@@ -314,10 +314,8 @@ class Dynamic(eqx.Module):
         sizes = {"components": self.components, "modes": self.modes, "keep": self.keep}
         name = "" if self.ranks is None else "_" + "_".join(map(str, (self.lobes, *self.ranks)))
         options = {**sizes, **target.options(f"dynamic{name}")}
-        transport = _padded(dynamic.vertices.compress(known.visible, brdf, pyramid=known.pyramid, **options), vertices)
-        return _bright(
-            dynamic.vertex_system.DynamicSystem(transport, brdf), transport.pyramid, shading, self.texels, target.size
-        )
+        transport = _padded(dynamic.compress(known.visible, brdf, pyramid=known.pyramid, **options), vertices)
+        return _bright(dynamic.DynamicSystem(transport, brdf), transport.pyramid, shading, self.texels, target.size)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
         """Number of bytes of the visibility, the weights of the components, the cores and the modes."""
@@ -325,7 +323,7 @@ class Dynamic(eqx.Module):
             return Lobes(texels=self.texels).least_bytes(shading, vertices=vertices, size=size)
         terms = 1 + (self.ranks[2] if self.ranks else 0)
         sizes = self.components, self.modes, self.keep
-        clusters, most = dynamic.vertices.clustering(vertices, terms, 6 * size**2, *sizes)
+        clusters, most = dynamic.transport.clustering(vertices, terms, 6 * size**2, *sizes)
         shared = 2 * clusters * most["modes"] * (most["keep"] + most["components"] * terms)
         seen = pyramid.scales(size).total + diffuse.count(size)
         return vertices * (seen + 4 * most["components"]) + shared
@@ -374,11 +372,11 @@ def lobe_table(shading: Shading, lobes: int) -> lobe.LobeBrdf:
     return lobe.tabulate(shading.brdf, lobes=lobes, knot=shading.knot)
 
 
-def dynamic_table(shading: Shading, lobes: int, ranks: tuple[int, int, int] | None) -> dynamic.table.DynamicBrdf:
+def dynamic_table(shading: Shading, lobes: int, ranks: tuple[int, int, int] | None) -> dynamic.DynamicBrdf:
     """The BRDF of a part as lobes and a tensor, over roughness if that varies."""
     if shading.table is not None:
         return shading.table.tensor(lobes, ranks)
-    return dynamic.table.tabulate(shading.brdf, lobes=lobes, ranks=ranks, knot=shading.knot)
+    return dynamic.tabulate(shading.brdf, lobes=lobes, ranks=ranks, knot=shading.knot)
 
 
 def harmonic_table(shading: Shading, *, degree: int) -> harmonic.HarmonicBrdf:

@@ -186,7 +186,7 @@ def _exported(name: str, system: System) -> Exported:
         vector = diffuse.harmonics_of(matte.vector, size=matte.size, degree=_DEGREE)
         transport = harmonic.TransferVector(vector[:, None], put(matte.position))
         inner = harmonic.DiffuseSystem(transport, put(inner.albedo))
-    if isinstance(inner, dynamic.vertex_system.DynamicSystem):
+    if isinstance(inner, dynamic.DynamicSystem):
         inner = inner.lobes
     if not isinstance(inner, Exported):
         raise ValueError(

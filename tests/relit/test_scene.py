@@ -31,6 +31,18 @@ from jaxprt.sphere import cubemap
 SIZE = 8
 EYE = jnp.array([1.0, 2.5, 2.0])
 GLOSSY = CookTorrance(diffuse=0.5, specular=0.5, roughness=0.5, f0=0.4)
+
+
+class Fixed(eqx.Module):
+    """A BRDF of no model that may change."""
+
+    brdf: CookTorrance
+
+    def __call__(self, wi, wo):
+        return self.brdf(wi, wo)
+
+
+FIXED = Fixed(GLOSSY)
 CAMERA = Camera(EYE, [0.0, 0.5, 0.0], [0.0, 1.0, 0.0], 1.0, 24, 16)
 NAMES = ["floor", "ball", "wall"]
 # What two tensors of eight components may differ by that have other regions: they do by .005, and by .1 if the parts of
@@ -140,19 +152,19 @@ def own_calls(name: str) -> prt.System:
     ball, recipe = mesh("ball"), RECIPES[name]
     if name == "lobe":
         transport = lobe.precompute(ball, size=SIZE, progress=False)
-        system = lobe.LobeSystem(transport, lobe.tabulate(GLOSSY, lobes=recipe.lobes))
-        samples = bright_texels.samples_for(GLOSSY, size=SIZE)
-        return bright_texels.BrightTexels(system, transport, GLOSSY, count=recipe.texels, samples=samples)
+        system = lobe.LobeSystem(transport, lobe.tabulate(FIXED, lobes=recipe.lobes))
+        samples = bright_texels.samples_for(FIXED, size=SIZE)
+        return bright_texels.BrightTexels(system, transport, FIXED, count=recipe.texels, samples=samples)
     if name == "harmonic":
         transport = harmonic.precompute(ball, degree=recipe.degree, size=SIZE, progress=False)
-        return harmonic.HarmonicSystem(transport, harmonic.tabulate(GLOSSY, degree=recipe.degree))
-    brdf = separable.factor(GLOSSY, terms=recipe.terms, resolution=16)
+        return harmonic.HarmonicSystem(transport, harmonic.tabulate(FIXED, degree=recipe.degree))
+    brdf = separable.factor(FIXED, terms=recipe.terms, resolution=16)
     return separable.SeparableSystem(separable.precompute(ball, brdf, keep=384, size=SIZE, progress=False), brdf)
 
 
 @pytest.mark.parametrize("name", ["lobe", "harmonic", "separable"])
 def test_a_scene_of_one_mesh_is_the_systems_own_bit_for_bit(name):
-    alone = Scene([Part("ball", mesh("ball"), GLOSSY)])
+    alone = Scene([Part("ball", mesh("ball"), FIXED)])
     ready = prt.precompute(alone, refine=False, system=RECIPES[name], size=SIZE, progress=False)
     expected = prt.radiance(own_calls(name), light(), eye=EYE)
     np.testing.assert_array_equal(ready.radiance(light(), eye=EYE), expected)
@@ -312,7 +324,7 @@ def test_parts_beyond_the_number_of_regions_send_light_together_if_they_are_alik
     red, blue = (TexturedMaterial(color, metallic=0.0, roughness=0.8) for color in ((0.8, 0.1, 0.1), (0.1, 0.1, 0.8)))
     colors = enumerate((red, blue))
     parts = [Part(f"{n} {name}", mesh(name), color) for n, color in colors for name in ("floor", "wall")]
-    other = [Part("ball", mesh("ball"), GLOSSY), Part("second ball", mesh("ball"), GLOSSY)]
+    other = [Part("ball", mesh("ball"), FIXED), Part("second ball", mesh("ball"), FIXED)]
     scenes = {}
     for count in (2, 16):
         monkeypatch.setattr(reflection, "_REGIONS", count)

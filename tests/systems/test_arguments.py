@@ -42,7 +42,7 @@ WANTED = {
     "jaxprt.harmonic.precompute": [lambda: prt.radiance(harmonic.HarmonicSystem(VECTOR, TABLE), COEFFICIENT, eye=EYE)],
     "jaxprt.separable.factor": [
         lambda: separable.SeparableSystem(SPARSE, MODEL),
-        lambda: dynamic.relight._check(0, None, MODEL, None, 2),
+        lambda: dynamic.set_relight._check(0, None, MODEL, None, 2),
     ],
     "jaxprt.lobe.tabulate": [
         lambda: lobe.LobeSystem(PYRAMID, MODEL),

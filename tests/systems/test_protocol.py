@@ -103,7 +103,7 @@ def factored(model: str) -> separable.SeparableBrdf:
 
 
 @functools.cache
-def members() -> dynamic.DynamicBrdf:
+def members() -> dynamic.BrdfSet:
     """MEMBERS as a set, with their lobes."""
     free = functools.partial(lobe.tabulate, lobes=4, resolution=8)
     return dynamic.factor(MEMBERS, dynamic.separate(MEMBERS, separator=free))
@@ -122,7 +122,7 @@ def harmonic_table(model: str) -> harmonic.HarmonicBrdf:
 
 
 @functools.cache
-def members_along() -> dynamic.DynamicBrdf:
+def members_along() -> dynamic.BrdfSet:
     """What the members reflect on to other surfaces."""
     return bounces.factor(MEMBERS, terms=6, resolution=16)
 
@@ -169,25 +169,25 @@ def bright(name: str, model: str) -> tuple[prt.System, Any]:
 
 
 @functools.cache
-def tensor(model: str) -> dynamic.table.DynamicBrdf:
+def tensor(model: str) -> dynamic.DynamicBrdf:
     """A BRDF as few lobes and a tensor."""
-    return dynamic.table.tabulate(MODELS[model], lobes=lobe_table(model), ranks=(2, 6, 6), resolution=16)
+    return dynamic.tabulate(MODELS[model], lobes=lobe_table(model), ranks=(2, 6, 6), resolution=16)
 
 
 @functools.cache
 def dynamics(name: str, model: str) -> tuple[prt.System, Any]:
     sizes = {"components": 16, "modes": 48, "keep": 384, "progress": False}
-    transport = dynamic.vertices.compress(seen(name), tensor(model), **sizes)
-    return dynamic.vertex_system.DynamicSystem(transport, tensor(model)), None
+    transport = dynamic.compress(seen(name), tensor(model), **sizes)
+    return dynamic.DynamicSystem(transport, tensor(model)), None
 
 
 @functools.cache
-def changing(name: str, model: str) -> tuple[dynamic.DynamicSystem, Any]:
+def changing(name: str, model: str) -> tuple[dynamic.SetSystem, Any]:
     brdfs = [members()] * (1 + (name == "scene"))
-    transport = dynamic.precompute(mesh(name), brdfs, size=SIZE, components=16, modes=32, keep=384, progress=False)
+    transport = dynamic.precompute_sets(mesh(name), brdfs, size=SIZE, components=16, modes=32, keep=384, progress=False)
     white = model == "white"
     material = dynamic.Material(np.full(2, 0.5), 1.0 if white else 0.5, 0.0 if white else 0.5)
-    return dynamic.DynamicSystem(transport, brdfs), [material] * len(brdfs)
+    return dynamic.SetSystem(transport, brdfs), [material] * len(brdfs)
 
 
 @functools.cache
@@ -629,7 +629,7 @@ def test_what_are_no_devices_and_what_has_no_vertices_are_refused():
         prt.shard(light(), [here])
 
 
-OF_REGIONS = dynamic.DynamicSystem | bounces.BouncesSystem | prt.RelitScene
+OF_REGIONS = dynamic.SetSystem | bounces.BouncesSystem | prt.RelitScene
 
 
 def at_points(case: Case, triangle: np.ndarray, weight: np.ndarray) -> tuple[prt.System, np.ndarray]:

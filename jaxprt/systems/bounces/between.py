@@ -6,7 +6,7 @@ halfway between each pair of BRDFs:
     H(w) = sum_m w_m H_m + sum_m<n w_m w_n 4 (H_mn - (H_m + H_n) / 2)
 
 H_mn is the projection of the BRDF halfway between m and n. If the BRDFs are of one model, this is the model with the
-mean parameters, as in `jaxprt.dynamic.DynamicBrdf.at`. Otherwise their lobes are moved halfway, and the residuals of
+mean parameters, as in `jaxprt.dynamic.BrdfSet.at`. Otherwise their lobes are moved halfway, and the residuals of
 the lobes are averaged. Light that is sent to other surfaces thus has the material that is seen.
 """
 

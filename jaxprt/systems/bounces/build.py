@@ -18,7 +18,7 @@ from jaxprt.scene.mesh import Mesh, areas
 from jaxprt.systems.bounces import functions, gather, jobs, patches
 from jaxprt.systems.bounces.patches import Patches
 from jaxprt.systems.bounces.tensor import SecondBounce, TransferTensor, scales, twice
-from jaxprt.systems.dynamic import DynamicBrdf
+from jaxprt.systems.dynamic import BrdfSet
 from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.visibility import members
@@ -33,7 +33,7 @@ _SAMPLE = 8  # number of clusters from which the worth of a bounce is estimated
 @require.arguments(**PRECOMPUTE)
 def precompute(
     mesh: Mesh,
-    brdfs: Sequence[DynamicBrdf | SeparableBrdf],
+    brdfs: Sequence[BrdfSet | SeparableBrdf],
     *,
     weights: Sequence[Float[Array, "_ _"] | None] | None = None,
     lamps: LampTransport | None = None,
@@ -94,7 +94,7 @@ def precompute(
     if lamps is not None:
         require.length("vertices of the lamps' transport", lamps.position, len(mesh.position))
     bases = tuple(jax.tree.map(np.asarray, functions.basis(brdf)) for brdf in brdfs)
-    factor = tuple(each.factor if isinstance(each, DynamicBrdf) else functions.fixed_weights(each) for each in brdfs)
+    factor = tuple(each.factor if isinstance(each, BrdfSet) else functions.fixed_weights(each) for each in brdfs)
     if path is not None:
         os.makedirs(path, exist_ok=True)
     run = _Run(path, executor, progress)
@@ -237,7 +237,7 @@ def _regions(mesh: Mesh, brdfs: Sequence) -> np.ndarray:
     if not isinstance(mesh, Mesh) or not isinstance(brdfs, Sequence):
         raise TypeError(f"mesh must be a Mesh and brdfs a list, got {type(mesh).__name__} and {type(brdfs).__name__}")
     for number, each in enumerate(brdfs):
-        if not isinstance(each, DynamicBrdf | SeparableBrdf):
+        if not isinstance(each, BrdfSet | SeparableBrdf):
             raise TypeError(
                 f"the BRDF of region {number} must be from jaxprt.bounces.factor or separable.factor, got "
                 f"{type(each).__name__}"
@@ -248,7 +248,7 @@ def _regions(mesh: Mesh, brdfs: Sequence) -> np.ndarray:
     return numbers
 
 
-def _check_weights(weights: Sequence[Array | None], brdfs: Sequence[DynamicBrdf | SeparableBrdf]) -> None:
+def _check_weights(weights: Sequence[Array | None], brdfs: Sequence[BrdfSet | SeparableBrdf]) -> None:
     """Refuses weights of other regions or channels."""
     if len(weights) != len(brdfs):
         raise ValueError(
@@ -257,7 +257,7 @@ def _check_weights(weights: Sequence[Array | None], brdfs: Sequence[DynamicBrdf 
     for number, (each, brdf) in enumerate(zip(weights, brdfs, strict=True)):
         if each is None:
             continue
-        if isinstance(brdf, DynamicBrdf):
+        if isinstance(brdf, BrdfSet):
             raise ValueError(f"the weights of region {number} must be None because it has a set of BRDFs, got an array")
         shape, channels = np.shape(each), brdf.view_map.shape[-1]
         if len(shape) != 2 or shape[0] != channels:

@@ -23,7 +23,7 @@ from jaxprt.decompose import tucker
 from jaxprt.sphere import harmonics, hemisphere
 from jaxprt.systems import dynamic
 from jaxprt.systems.bounces import between
-from jaxprt.systems.dynamic import DynamicBrdf
+from jaxprt.systems.dynamic import BrdfSet
 from jaxprt.systems.dynamic.reflected import Reflected
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.separable import SeparableBrdf
@@ -44,7 +44,7 @@ def factor(
     functions: int | None = None,
     terms: int = 32,
     resolution: int = 32,
-) -> DynamicBrdf:
+) -> BrdfSet:
     """A set of BRDFs for light paths: functions that represent the set, factored over the light, without lobes.
 
     The decomposition minimizes the squared error of the light that the BRDFs reflect under light with a natural
@@ -98,7 +98,7 @@ def factor(
     error = _missed(smooth[:count], along[:count], least)
     pairs = np.eye(functions * terms, dtype=error.dtype).reshape(functions, terms, -1).swapaxes(1, 2)
     along = between.quadratic(along.reshape(-1, colors, functions), pair, count=len(brdfs))
-    return DynamicBrdf(jnp.asarray(pairs), along, view, light, None, dynamic.reflected.stacked(brdfs), error)
+    return BrdfSet(jnp.asarray(pairs), along, view, light, None, dynamic.reflected.stacked(brdfs), error)
 
 
 def shared(
@@ -215,7 +215,7 @@ def _missed(smooth: Float[Array, "n s b"], along: Float[Array, "n h"], least: tu
     return jnp.sqrt(jnp.vdot(sent - smooth, sent - smooth) / jnp.where(whole > 0, whole, 1))
 
 
-def basis(brdf: DynamicBrdf | SeparableBrdf) -> SeparableBrdf:
+def basis(brdf: BrdfSet | SeparableBrdf) -> SeparableBrdf:
     """The path functions f_p, as the colors of a factored BRDF.
 
     Args:
@@ -285,7 +285,7 @@ def weights(
     Between BRDFs of the set, the weights approximate the true BRDF; see `jaxprt.bounces.between`.
 
     Args:
-        factor: The attribute `factor` of the set, a `jaxprt.dynamic.DynamicBrdf`.
+        factor: The attribute `factor` of the set, a `jaxprt.dynamic.BrdfSet`.
         weight: Weight of each BRDF in the set. `jaxprt.brdf.navigation` makes them.
         diffuse: Albedo of the diffuse part.
         specular: Factor of the set's BRDF.

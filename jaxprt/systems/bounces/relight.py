@@ -27,7 +27,7 @@ from jaxprt.systems import dynamic, protocol
 from jaxprt.systems.bounces import functions, gather
 from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.bounces.tensor import TransferTensor
-from jaxprt.systems.dynamic import DynamicBrdf, DynamicTransport, Material, RegionBrdf
+from jaxprt.systems.dynamic import BrdfSet, Material, RegionBrdf, SetTransport
 from jaxprt.systems.separable import SeparableBrdf
 
 
@@ -72,9 +72,9 @@ class ReflectedView(eqx.Module):
 
 
 def radiance(
-    transport: DynamicTransport,
+    transport: SetTransport,
     tensor: TransferTensor,
-    brdfs: Sequence[DynamicBrdf | SeparableBrdf],
+    brdfs: Sequence[BrdfSet | SeparableBrdf],
     materials: Sequence[Material | None],
     light: Environment,
     *,
@@ -125,7 +125,7 @@ def light_side(tensor: TransferTensor, light: Environment) -> LitTransfer:
 
 
 def arriving(
-    transport: DynamicTransport, tensor: TransferTensor, light: LitTransfer, materials: Sequence[Material | None]
+    transport: SetTransport, tensor: TransferTensor, light: LitTransfer, materials: Sequence[Material | None]
 ) -> tuple[Arriving, ...]:
     """Reflected light that arrives at the vertices of each region, given the light and all materials, for any view.
 
@@ -145,7 +145,7 @@ def arriving(
 
 @jit
 def _arriving(
-    transport: DynamicTransport, tensor: TransferTensor, light: LitTransfer, weight, change
+    transport: SetTransport, tensor: TransferTensor, light: LitTransfer, weight, change
 ) -> tuple[Arriving, ...]:
     whole = collect(tensor, light, weight, change=change)
     return tuple(_turned(whole, each.vertex, each.seen.frame) for each in transport.region)
@@ -163,7 +163,7 @@ def weights(tensor: TransferTensor, materials: Sequence[Material | None]) -> Flo
         if material is None:
             rows.append(factor)
             continue
-        dynamic.relight.check_material(number, material, len(factor), len(tensor.place))
+        dynamic.set_relight.check_material(number, material, len(factor), len(tensor.place))
         area = jnp.where(tensor.region == number, tensor.area, 0)
         diffuse, specular = (
             each if each.ndim == 1 else area_mean(each, area) for each in (material.diffuse, material.specular)
@@ -262,7 +262,7 @@ def _beside(first: Float[Array, "g c n s"], second: Float[Array, "g d m s"]) -> 
 
 
 def view_side(
-    transport: DynamicTransport,
+    transport: SetTransport,
     surfaces: Sequence[RegionBrdf],
     *,
     eye: Float[Array, "3"],
@@ -281,7 +281,7 @@ def view_side(
 
 
 @jit
-def _view_side(transport: DynamicTransport, surfaces, eye: Array, points) -> tuple[ReflectedView, ...]:
+def _view_side(transport: SetTransport, surfaces, eye: Array, points) -> tuple[ReflectedView, ...]:
     result = []
     for own, each, at in zip(transport.region, surfaces, points or [None] * len(surfaces), strict=True):
         position, frame = placed(own.seen.position, own.seen.frame, at)
@@ -301,7 +301,7 @@ def _view_side(transport: DynamicTransport, surfaces, eye: Array, points) -> tup
 
 @isolated
 def combine(
-    transport: DynamicTransport,
+    transport: SetTransport,
     arriving: tuple[Arriving, ...],
     view: tuple[ReflectedView, ...],
     *,

@@ -30,12 +30,12 @@ class BouncesSystem(protocol.System):
     """
 
     tensor: TransferTensor
-    direct: dynamic.DynamicSystem
+    direct: dynamic.SetSystem
 
     def __check_init__(self):
         """Refuses other kinds of tensors and systems, and different numbers of vertices."""
         require.kind("the tensor", self.tensor, TransferTensor, source="jaxprt.bounces.precompute")
-        require.kind("the direct system", self.direct, dynamic.DynamicSystem, source="jaxprt.dynamic.DynamicSystem")
+        require.kind("the direct system", self.direct, dynamic.SetSystem, source="jaxprt.dynamic.SetSystem")
         count = len(self.direct.transport.place)
         if len(self.tensor.place) != count:
             raise ValueError(f"the tensor must have the transport's {count} vertices, got {len(self.tensor.place)}")
@@ -66,7 +66,7 @@ class BouncesSystem(protocol.System):
         return combine(self.direct.transport, light, view, points=self.direct.points)
 
     def at(self, points: Sequence[Points]) -> "BouncesSystem":
-        """The same system at points of each region; see `DynamicSystem.at`."""
+        """The same system at points of each region; see `SetSystem.at`."""
         return BouncesSystem(self.tensor, self.direct.at(points))
 
     @property

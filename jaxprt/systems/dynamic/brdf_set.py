@@ -51,7 +51,7 @@ class Mixed(eqx.Module):
         return value + self.lobe(wi, wo) / jnp.maximum(wi[..., 2:], _GRAZING)
 
 
-class DynamicBrdf(eqx.Module):
+class BrdfSet(eqx.Module):
     """A set of BRDFs without their diffuse parts.
 
     Attributes:
@@ -184,7 +184,7 @@ def factor(
     *,
     ranks: tuple[int, int, int] | None = None,
     resolution: int = 32,
-) -> DynamicBrdf:
+) -> BrdfSet:
     """Makes a set of BRDFs from their lobes and a Tucker decomposition of the residual.
 
     Eight free lobes leave a residual that is not visible, so `ranks` can be None. With the published
@@ -219,7 +219,7 @@ def factor(
             raise ValueError("a set needs lobes, or ranks of a tensor, or both; got neither")
         shapes = ((0, 0, 0), (len(brdfs), len(lobe.weight), 0), (0, 4, 4))
         core, along, maps = (jnp.zeros(each, lobe.scale.dtype) for each in shapes)
-        return DynamicBrdf(core, along, maps, maps, lobe, together, lobe.error)
+        return BrdfSet(core, along, maps, maps, lobe, together, lobe.error)
     inside = int(np.count_nonzero(hemisphere.parabolic_texel_area(resolution=resolution)))
     check_ranks(ranks, (len(brdfs) * colors, inside, (reflected.DEGREE + 1) ** 2))
     found = reflected.reflect(brdfs, lobe, resolution=resolution)
@@ -235,7 +235,7 @@ def decompose(
     ranks: tuple[int, int, int],
     rest: tuple[LobeBrdf | None, Callable | None],
     coordinates: Callable,
-) -> DynamicBrdf:
+) -> BrdfSet:
     """Tucker decomposition of the light that a set of BRDFs reflects, and the maps of its factors.
 
     View maps, and then light maps, are the least-squares solution for fixed other factors. View maps also cover texels
@@ -259,7 +259,7 @@ def decompose(
     flat, met = _met(tensor, weight, inside)
     found = tucker.orient(tucker.truncated(met, ranks=tuple(ranks)))
     core, along, view, light, error = _maps(found, flat, met, to_map, weight, whole, inside)
-    return DynamicBrdf(core, along.reshape(count, colors, -1), view, light, *rest, error, coordinates)
+    return BrdfSet(core, along.reshape(count, colors, -1), view, light, *rest, error, coordinates)
 
 
 @jit

@@ -1,86 +1,156 @@
-"""The dynamic system: light, view, combine and points."""
+"""The dynamic system: direct light on surfaces whose light, view and BRDF all change.
 
-from collections.abc import Sequence
+    B(x, wo) = sum_l g_l(wo, material) sum_b L_b T_x(b, l) + lobes + d(wo, material) E_x / pi
+
+The transport T of the light factors and the irradiance E are redone with the light, the view factors g, the lobes and
+the albedo d with the view or the materials.
+"""
+
+import dataclasses
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxprt import require
+from jaxprt.compile import jit
 from jaxprt.scene.environment import Environment
-from jaxprt.scene.points import Points
+from jaxprt.scene.points import Points, placed
+from jaxprt.sphere import directions
 from jaxprt.systems import protocol
-from jaxprt.systems.dynamic.brdf_set import DynamicBrdf
-from jaxprt.systems.dynamic.relight import DynamicLight, DynamicView, Material, combine, light_side, view_side
-from jaxprt.systems.dynamic.transport import DynamicTransport
-from jaxprt.systems.separable import SeparableBrdf
+from jaxprt.systems.dynamic.table import DynamicBrdf
+from jaxprt.systems.dynamic.transport import DynamicTransport, light_factors
+from jaxprt.systems.lobe import LobeSystem, diffuse
+from jaxprt.systems.lobe.blurred_light import LobeLight
+from jaxprt.systems.lobe.system import LobeView
+from jaxprt.systems.protocol import Blend
+from jaxprt.systems.separable.factorization import check_mark
+from jaxprt.systems.separable.system import combine, project
 
 
-class DynamicSystem(protocol.System):
-    """Direct light on a mesh of regions. Each region has a set of BRDFs, within which its material can change.
+class DynamicLight(eqx.Module):
+    """A light, and what arrives of it at the vertices.
 
-    Materials are a list with one `Material` for each region, None for a region with one fixed BRDF.
+    Attributes:
+        coefficient: Haar coefficients of the light.
+        blurred: The light, blurred for lobes. After `DynamicSystem.shade` with the irradiance of the vertices.
+        arriving: Light that arrives at each vertex, projected on the light factors; None before `shade`.
+    """
+
+    coefficient: Float[Array, "b c"]
+    blurred: LobeLight
+    arriving: Float[Array, "v r c"] | None = None
+
+
+class DynamicView(eqx.Module):
+    """A view of vertices or points with their materials.
+
+    Attributes:
+        factor: View factors of the terms.
+        lobes: Texels of the blurred light that the lobes read, and the albedo of the diffuse part.
+    """
+
+    factor: Float[Array, "v r d"]
+    lobes: LobeView
+
+
+class DynamicSystem(protocol.VertexSystem):
+    """Transport of light factors, with a BRDF as lobes, a diffuse part and a tensor over its parameters.
+
+    A `Blend` weights the channels of the BRDF and holds the parameters of each vertex.
 
     Attributes:
         transport: Transport from `jaxprt.dynamic.precompute`.
-        brdf: BRDF of each region, from `jaxprt.dynamic.factor` or `jaxprt.separable.factor`.
-        texels: Number of brightest texels that are summed one by one.
-        samples: Number of points along the edge of each of them at which the BRDF is evaluated; see
-            `jaxprt.bright_texels.samples_for`.
-        points: Points on each region at which radiance is computed; None for the vertices.
+        brdf: The BRDF, from `jaxprt.dynamic.tabulate`, for whose light factors the transport was made.
     """
 
     transport: DynamicTransport
-    brdf: tuple[DynamicBrdf | SeparableBrdf, ...] = eqx.field(converter=tuple)
-    texels: int = eqx.field(static=True, default=16)
-    samples: int = eqx.field(static=True, default=1)
-    points: tuple[Points, ...] | None = None
+    brdf: DynamicBrdf
 
     def __check_init__(self):
-        """Refuses transport and BRDFs of other systems."""
+        """Refuses transport and BRDFs of other systems, and transport that was precomputed for another BRDF."""
         require.kind("the transport", self.transport, DynamicTransport, source="jaxprt.dynamic.precompute")
-        source = "jaxprt.dynamic.factor or jaxprt.separable.factor"
-        for number, each in enumerate(self.brdf):
-            require.kind(f"the BRDF of region {number}", each, DynamicBrdf, SeparableBrdf, source=source)
-        if len(self.brdf) != len(self.transport.region):
-            raise ValueError(
-                f"BRDFs must be one for each of {len(self.transport.region)} regions, got {len(self.brdf)}"
-            )
+        require.kind("the BRDF", self.brdf, DynamicBrdf, source="jaxprt.dynamic.tabulate")
+        if self.brdf.terms + 1 != self.transport.terms.terms:
+            most = self.transport.terms.terms - 1
+            raise ValueError(f"the BRDF must have the transport's {most} light factors, got {self.brdf.terms}")
+        check_mark(self.transport.terms.mark, light_factors(self.brdf).light_map)
 
     def light(self, environment: Environment) -> DynamicLight:
-        """Projects an environment for all regions: `jaxprt.dynamic.light_side`."""
-        return light_side(self.transport, environment, texels=self.texels)
+        """The light's wavelet coefficients, and the light blurred by lobes of about a dozen widths."""
+        environment = protocol.one_light(environment, size=self.transport.size)
+        return DynamicLight(project(environment), self.lobes.light(environment))
 
-    def view(self, eye: Float[Array, "3"], materials: Sequence[Material | None] | None = None) -> DynamicView:
-        """What depends on the view and the materials: `jaxprt.dynamic.view_side`."""
-        return view_side(self.transport, self.brdf, self.given(materials), eye=eye, points=self.points)
+    @jit
+    def shade(self, light: DynamicLight, materials: Blend | None = None) -> DynamicLight:
+        """The light that arrives at the vertices, projected on the light factors. Materials do not change it."""
+        require.kind("the light", light, DynamicLight, source="DynamicSystem.light")
+        arriving = self.transport.terms.apply(light.coefficient)
+        blurred = dataclasses.replace(light.blurred, irradiance=arriving[:, -1].T)
+        return DynamicLight(light.coefficient, blurred, arriving[:, :-1])
+
+    def tilted(self, light: DynamicLight, normal: Float[Array, "v 3"]) -> DynamicLight:
+        """The light with vector irradiance, for the diffuse part: `System.tilted`."""
+        pyramid, blurred = self.transport.pyramid, light.blurred
+        assert blurred.irradiance is not None
+        flux = diffuse.flux(blurred.coefficient, pyramid.vector, normal, size=pyramid.size)
+        return dataclasses.replace(light, blurred=dataclasses.replace(blurred, flux=_turned(flux, blurred, normal)))
+
+    def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> DynamicView:
+        """View factors of the terms, and texels at which each vertex reads the blurred light for its lobes."""
+        protocol.check_blend(materials)
+        eye = require.position("the eye", eye, each=self.vertices)
+        if materials is not None:
+            materials.check(self.vertices, self.brdf.channels)
+        wo = _direction(self.transport.position, self.transport.frame, self.points, eye)
+        return DynamicView(self.brdf.view(wo, materials), self.lobes.view(eye, materials))
 
     def combine(self, light: DynamicLight, view: DynamicView) -> Float[Array, "v c"]:
-        """Radiance in direct light."""
+        """Radiance: terms, lobes and the diffuse part."""
         require.kind("the light", light, DynamicLight, source="DynamicSystem.light")
         require.kind("the view", view, DynamicView, source="DynamicSystem.view")
-        return combine(self.transport, light, view, samples=self.samples)
+        light = self.shade(light) if light.arriving is None else light
+        assert light.arriving is not None
+        result = self.lobes.combine(light.blurred, view.lobes)
+        if not self.brdf.terms:
+            return result
+        return result + combine(self.carried(light.arriving), view.factor)
 
-    def given(self, materials: Sequence[Material | None] | None) -> Sequence[Material | None]:
-        """The materials; None for each region if none are given.
-
-        Raises:
-            TypeError: `materials` is not a sequence.
-        """
-        if materials is None:
-            return [None] * len(self.brdf)
-        if not isinstance(materials, Sequence):
-            raise TypeError(f"the materials must be a list, one for each region, got {type(materials).__name__}")
-        return materials
-
-    def at(self, points: Sequence[Points]) -> "DynamicSystem":
-        """The same system at points of each region, concatenated; see `System.at`.
-
-        Corners of the points are indices into the vertices of their region.
-        """
-        given = protocol.check_points(points, [len(each.seen.position) for each in self.transport.region])
-        return eqx.tree_at(lambda each: each.points, self, given, is_leaf=lambda each: each is None)
+    @property
+    def lobes(self) -> LobeSystem:
+        """The lobes and the diffuse part alone, without the tensor: what exported pages show."""
+        return LobeSystem(self.transport.pyramid, self.brdf.lobe, points=self.points)
 
     @property
     def vertices(self) -> int:
-        """Number of vertices, or of points if the system was moved to points by `at`."""
-        return len(self.transport.place) if self.points is None else sum(map(len, self.points))
+        """Number of vertices, or of points where radiance is evaluated at points."""
+        return len(self.transport.position if self.points is None else self.points)
+
+    @property
+    def shared_light(self) -> tuple:
+        """Key of the light, which depends on the environment and its size only."""
+        return DynamicSystem, self.transport.size
+
+
+@jit
+def _direction(position: Array, frame: Array, points: Points | None, eye: Array) -> Float[Array, "v 3"]:
+    """Directions to the viewer in the frames of the light factors.
+
+    Points whose normals are tilted by a normal map have light factors in the frames without it. There they are seen
+    from where the mirror direction of the tilted normal is also that of the frame.
+    """
+    place, axes = placed(position, frame, points)
+    wo = directions.view(axes, place, eye)
+    if points is None or points.normal is None:
+        return wo
+    smooth = points.tilted(None).frame(frame)
+    mirror = jnp.einsum("vi,vij->vj", wo * jnp.array([-1.0, -1.0, 1.0], wo.dtype), axes, precision="highest")
+    return jnp.einsum("vij,vj->vi", smooth, mirror, precision="highest") * jnp.array([-1.0, -1.0, 1.0], wo.dtype)
+
+
+@jit
+def _turned(flux: Float[Array, "c 3 v"], light: LobeLight, normal: Float[Array, "v 3"]) -> Float[Array, "c 3 v"]:
+    """Vector irradiance whose component along the normals is the irradiance of the transport."""
+    assert light.irradiance is not None
+    along = jnp.sum(flux * normal.T, 1)
+    return flux + (light.irradiance - along)[:, None] * normal.T

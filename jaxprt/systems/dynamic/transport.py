@@ -1,204 +1,160 @@
-"""Transport of scenes whose materials change: for each region of a mesh, what its set of BRDFs requires.
-
-Direct light is projected on the light factors of a region's set, which all BRDFs of the set share, and on a constant
-factor for the diffuse part. Visibility for lobes and single texels does not depend on the BRDF. A region with one fixed
-BRDF uses the light factors of that BRDF, and stores only the visibility bits for single texels.
-"""
+"""Transport for BRDFs that change: the light factors, compressed by clusters of vertices, and visibility for lobes."""
 
 import os
 import pathlib
-from collections.abc import Sequence
 from concurrent.futures import Executor
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float
 
 from jaxprt import require, visibility
 from jaxprt.scene.mesh import Mesh
+from jaxprt.sphere import hemisphere
 from jaxprt.systems import lobe, separable
-from jaxprt.systems.dynamic.brdf_set import DynamicBrdf
-from jaxprt.systems.lobe import LobeTransport, pyramid
+from jaxprt.systems.dynamic.table import DynamicBrdf
+from jaxprt.systems.lobe import LobeTransport
 from jaxprt.systems.separable import ClusteredTransport, SeparableBrdf
 from jaxprt.visibility import StoredVisibility
 from jaxprt.visibility.rays import PRECOMPUTE
 
-_MEMBERS = 230  # number of vertices of a cluster in a large region
-_CLUSTERS = 64  # number of clusters of a smaller region, if each then has at least
+_MEMBERS = 230  # number of vertices of a cluster in a large mesh
+_CLUSTERS = 64  # number of clusters of a smaller mesh, if each then has at least
 _FEWEST = 32  # vertices
 
 
-class RegionTransport(eqx.Module):
-    """Transport of the vertices of one region, in the mesh's order.
+class DynamicTransport(eqx.Module):
+    """Transport of vertices whose BRDF may change.
 
     Attributes:
-        terms: Transport of the light factors. If the BRDF can change, the last term is the constant one of the diffuse
-            part.
-        seen: Visibility of each vertex: bits of all texels, and pyramids if the BRDFs have lobes.
-        vertex: Index of each vertex in the mesh.
+        terms: Transport of the light factors. The last term is the constant one, for the diffuse part.
+        pyramid: Visibility pyramids for the lobes.
     """
 
     terms: ClusteredTransport
-    seen: LobeTransport
-    vertex: Int[Array, " w"]
+    pyramid: LobeTransport
 
     @property
-    def nbytes(self) -> int:
-        """Bytes of the transport."""
-        return self.terms.nbytes + self.seen.nbytes
+    def position(self) -> Float[Array, "v 3"]:
+        """Vertex positions in world units."""
+        return self.pyramid.position
 
-
-class DynamicTransport(eqx.Module):
-    """Transport of all regions of a mesh.
-
-    Attributes:
-        region: Transport of each region, in the order of their numbers.
-        place: Index of each vertex of the mesh among the vertices of all regions, concatenated.
-        mesh: Fingerprint of the mesh. Bounces of another mesh are refused. Empty if the transport was made by hand.
-    """
-
-    region: tuple[RegionTransport, ...]
-    place: Int[Array, " v"]
-    mesh: str = eqx.field(static=True, default="")
+    @property
+    def frame(self) -> Float[Array, "v 3 3"]:
+        """Shading frame of each vertex; rows are tangent, bitangent, normal."""
+        return self.pyramid.frame
 
     @property
     def size(self) -> int:
         """Edge of the light's cubemap faces in texels."""
-        return self.region[0].seen.size
+        return self.pyramid.size
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all regions."""
-        return sum(each.nbytes for each in self.region)
+        """Bytes of the terms and of the visibility."""
+        return self.terms.nbytes + self.pyramid.nbytes
 
 
 @require.arguments(**PRECOMPUTE)
 def precompute(
     mesh: Mesh,
-    brdfs: Sequence[DynamicBrdf | SeparableBrdf],
+    brdf: DynamicBrdf,
     *,
     components: int = 24,
     modes: int = 128,
     keep: int = 1024,
     size: int = 64,
     occluder: Mesh | None = None,
+    vertex: np.ndarray | None = None,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
     progress: bool = True,
 ) -> DynamicTransport:
-    """Traces the visibility of each vertex, and compresses the transport of the light factors of its region.
+    """Traces the visibility of each vertex, and compresses the transport of the light factors of a BRDF.
 
     Args:
         mesh: Mesh with the vertices to light.
-        brdfs: For each region, in the order of their numbers: a set of BRDFs, or one factored BRDF that cannot change.
+        brdf: The BRDF, from `tabulate`. Without a tensor, the transport serves any other one without a tensor.
         components: Number of principal components over the vertices of a cluster, limited by the number of vertices.
         modes: Number of principal components over the light, shared by all components and terms of a cluster; limited
             by `keep` and by the number of components times terms.
         keep: Number of wavelet coefficients of each cluster.
         size: Edge of the light's cubemap faces in texels, a power of two, at least 8.
         occluder: Mesh that casts shadows: the whole scene, or a simplified one. If None, the mesh itself.
+        vertex: Indices of the vertices to precompute; all if None.
         path: Folder in which finished work is stored. A call that was interrupted resumes from there.
         executor: Executor that computes the blocks of work; all cores of this machine if None.
         progress: Whether to show progress bars.
 
     Returns:
-        The transport: 3 kB of bits for each vertex, another 3 kB of pyramids if there are lobes, and the terms.
+        The transport: 6 kB of pyramids for each vertex, and the terms.
 
     Raises:
-        TypeError: `brdfs` is not a sequence, or a BRDF is neither a set nor factored.
-        ValueError: There is not one BRDF for each region, light maps differ by color, or for the reasons that
-            `jaxprt.visibility.precompute` gives.
+        TypeError: The BRDF was not made by `tabulate`.
+        ValueError: For the reasons that `jaxprt.visibility.precompute` gives.
 
     Reference: Sun et al. 2007, sections 3.3 and 4.3, direct lighting.
     """
-    if not isinstance(brdfs, Sequence):
-        raise TypeError(f"brdfs must be a sequence, one for each region, got {type(brdfs).__name__}")
-    numbers = np.unique(np.asarray(mesh.region))
-    if len(brdfs) != len(numbers):
-        raise ValueError(f"brdfs must be one for each of the regions {numbers.tolist()}, got {len(brdfs)}")
-    for brdf in brdfs:
-        if not isinstance(brdf, DynamicBrdf | SeparableBrdf):
-            raise TypeError(
-                f"each BRDF must be made by jaxprt.dynamic.factor or jaxprt.separable.factor, got {type(brdf).__name__}"
-            )
-    pyramid.scales(size)
-    regions = []
-    for number, brdf in zip(numbers.tolist(), brdfs, strict=True):
-        vertex = np.flatnonzero(np.asarray(mesh.region) == number)
-        folder = None if path is None else pathlib.Path(path) / f"region_{number}"
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-        visible = visibility.precompute(
-            mesh,
-            size=size,
-            occluder=occluder,
-            vertex=vertex,
-            path=folder and folder / "visibility.prt",
-            executor=executor,
-            progress=progress,
-        )
-        at = folder and folder / "clusters.prt"
-        each = compress(visible, brdf, components, modes, keep, path=at, executor=executor, progress=progress)
-        regions.append(RegionTransport(each.terms, each.seen, jnp.asarray(vertex, jnp.int32)))
-    place = np.argsort(np.concatenate([each.vertex for each in regions]))
-    return DynamicTransport(tuple(regions), jnp.asarray(place, jnp.int32), visibility.blocks.scene_key(mesh))
+    require.kind("the BRDF", brdf, DynamicBrdf, source="jaxprt.dynamic.tabulate")
+    lobe.pyramid.scales(size)
+    folder = None if path is None else pathlib.Path(path)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+    options = {"executor": executor, "progress": progress}
+    visible = visibility.precompute(
+        mesh, size=size, occluder=occluder, vertex=vertex, path=folder and folder / "visibility.prt", **options
+    )
+    sizes = {"components": components, "modes": modes, "keep": keep}
+    return compress(visible, brdf, **sizes, path=folder and folder / "clusters.prt", **options)
 
 
 def compress(
     visible: StoredVisibility,
-    brdf: DynamicBrdf | SeparableBrdf,
-    components: int,
-    modes: int,
-    keep: int,
+    brdf: DynamicBrdf,
     *,
+    components: int = 24,
+    modes: int = 128,
+    keep: int = 1024,
+    pyramid: LobeTransport | None = None,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
     progress: bool = True,
-) -> RegionTransport:
-    """Compresses the transport of one region from its visibility. `vertex` of the result numbers the given vertices.
+) -> DynamicTransport:
+    """Compresses the transport of some vertices from their visibility; see `precompute`.
 
     Args:
-        visible: Visibility of the region's vertices.
-        brdf: The region's set of BRDFs, or its one factored BRDF.
+        visible: Visibility of the vertices.
+        brdf: The BRDF.
         components: Number of principal components over the vertices of a cluster.
         modes: Number of principal components over the light.
         keep: Number of wavelet coefficients of each cluster.
+        pyramid: The visibility pyramids, if they exist already.
         path: Folder in which finished work is stored.
         executor: Executor that computes the blocks of work; all cores of this machine if None.
         progress: Whether to show progress bars.
     """
-    count = len(visible.position)
     factors = light_factors(brdf)
-    clusters = max(1, round(count / _MEMBERS), min(_CLUSTERS, count // _FEWEST))
-    components = min(components, count // clusters)
-    keep = min(keep, visible.texels)
-    terms = separable.clustered.precompute(
-        visible,
-        factors,
-        clusters=clusters,
-        components=components,
-        modes=min(modes, keep, components * factors.terms),
-        keep=keep,
-        path=path,
-        executor=executor,
-        progress=progress,
-    )
-    seen = lobe.compress(visible)
-    # The diffuse part is a term, so transfer vectors are not needed. Only lobes read the pyramid's means.
-    lobes = isinstance(brdf, DynamicBrdf) and brdf.lobe is not None
-    pyramid = seen.pyramid if lobes else seen.pyramid[:, : 6 * seen.size**2 // 8]
-    seen = LobeTransport(pyramid, seen.vector[:0], seen.position, seen.frame, seen.size)
-    return RegionTransport(terms, seen, jnp.arange(count))
+    clusters, sizes = clustering(len(visible.position), factors.terms, visible.texels, components, modes, keep)
+    options = {"path": path, "executor": executor, "progress": progress}
+    terms = separable.clustered.precompute(visible, factors, clusters=clusters, **sizes, **options)
+    return DynamicTransport(terms, lobe.compress(visible) if pyramid is None else pyramid)
 
 
-def light_factors(brdf: DynamicBrdf | SeparableBrdf) -> SeparableBrdf:
-    """The light factors that a region's transport is made for. For a set, a constant factor 1 / pi follows them.
+def clustering(
+    vertices: int, terms: int, texels: int, components: int, modes: int, keep: int
+) -> tuple[int, dict[str, int]]:
+    """Number of clusters, and sizes of the compression, limited by what there is."""
+    clusters = max(1, round(vertices / _MEMBERS), min(_CLUSTERS, vertices // _FEWEST))
+    components, keep = min(components, vertices // clusters), min(keep, texels)
+    return clusters, {"components": components, "modes": min(modes, keep, components * terms), "keep": keep}
+
+
+def light_factors(brdf: DynamicBrdf) -> SeparableBrdf:
+    """The light factors that the transport is made for, followed by the constant 1 / pi of the diffuse part.
 
     The view maps are all ones, because transport does not depend on them.
     """
-    if isinstance(brdf, SeparableBrdf):
-        return brdf
-    light = jnp.concatenate([brdf.light_map, jnp.full((1, *brdf.light_map.shape[1:]), 1 / np.pi, brdf.light_map.dtype)])
-    light = light[..., None]
-    return SeparableBrdf(light, jnp.ones_like(light), brdf.error, brdf.coordinates)
+    constant = jnp.full((1, *brdf.light_map.shape[1:]), 1 / np.pi, brdf.light_map.dtype)
+    light = jnp.concatenate([brdf.light_map, constant])[..., None]
+    return SeparableBrdf(light, jnp.ones_like(light), brdf.error, hemisphere.parabolic_coordinates)

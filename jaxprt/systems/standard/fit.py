@@ -179,7 +179,7 @@ def columns(made: Material, table: LobeBrdf) -> dict[str, np.ndarray]:
 
 def tensor(made: Material, table: LobeBrdf) -> dict[str, np.ndarray]:
     """Arrays of the tensor for what the lobes of a table leave, and what its diffuse part is to be changed by."""
-    brdf = dynamic.table.tabulate(made.family, lobes=table, ranks=tables.RANKS, knot=(made.knots,))
+    brdf = dynamic.tabulate(made.family, lobes=table, ranks=tables.RANKS, knot=(made.knots,))
     return {
         "tensor.core": np.asarray(brdf.core, np.float32),
         "tensor.factor": np.asarray(brdf.factor, np.float32),

@@ -21,7 +21,7 @@ from jaxprt.sphere import harmonics, hemisphere
 from jaxprt.systems import dynamic, lobe
 from jaxprt.systems.bounces import traced
 from jaxprt.systems.bounces.varying import Sent
-from jaxprt.systems.dynamic.table import DynamicBrdf
+from jaxprt.systems.dynamic import DynamicBrdf
 from jaxprt.systems.harmonic import HarmonicBrdf
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.separable import SeparableBrdf
@@ -261,9 +261,7 @@ def _tensor(table: StandardTable, lobes: int, ranks: tuple[int, int, int] | None
     if not table.has_tensor(lobes, ranks):
         with jax.ensure_compile_time_eval():
             knot = (np.asarray(table._stored["knot"]),)
-            return dynamic.table.tabulate(
-                table.family, lobes=table.lobes(lobes) if lobes else 0, ranks=ranks, knot=knot
-            )
+            return dynamic.tabulate(table.family, lobes=table.lobes(lobes) if lobes else 0, ranks=ranks, knot=knot)
     if ranks is None:
         return dynamic.table.without_tensor(table.lobes(lobes))
     held = table.lobes(lobes)

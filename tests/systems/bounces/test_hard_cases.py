@@ -45,7 +45,7 @@ def scene(*parts):
 
 def bounced(mesh, brdfs, light=ONES):
     """Direct and reflected radiance."""
-    transport = dynamic.precompute(mesh, brdfs, size=SIZE, progress=False)
+    transport = dynamic.precompute_sets(mesh, brdfs, size=SIZE, progress=False)
     tensor = bounces.precompute(mesh, brdfs, **OPTIONS)
     arguments = (brdfs, [None] * len(brdfs), light)
     first = dynamic.radiance(transport, *arguments, eye=EYE, texels=0)

@@ -37,7 +37,7 @@ def brdfs():
 
 @pytest.fixture(scope="module")
 def transport(mesh, brdfs):
-    return dynamic.precompute(mesh, brdfs, size=SIZE, progress=False)
+    return dynamic.precompute_sets(mesh, brdfs, size=SIZE, progress=False)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def test_what_lobes_send_of_harmonics_is_their_integral(transport, brdfs, tensor
 
 def test_what_a_factored_brdf_sends_of_harmonics_is_its_integral(mesh):
     glossy = separable.factor(CookTorrance(diffuse=0.3, specular=0.5, roughness=0.5, f0=0.3), terms=6, resolution=16)
-    transport = dynamic.precompute(mesh, [glossy, glossy], size=8, progress=False)
+    transport = dynamic.precompute_sets(mesh, [glossy, glossy], size=8, progress=False)
     seen = bounces.view_side(transport, dynamic.mix(transport, [glossy, glossy], [None, None]), eye=EYE)[0]
     own = transport.region[0]
     wo, coefficient, value = towards_eye(own), np.asarray(seen.coefficient), jax.jit(lambda wi, wo: glossy(wi, wo))
@@ -109,7 +109,7 @@ def test_what_a_factored_brdf_sends_of_harmonics_is_its_integral(mesh):
 def test_a_white_world_is_that_of_the_harmonic_system_and_nearly_invisible(mesh):
     """White surfaces under constant light: what two bounces leave of radiance one is little."""
     white = separable.factor(Lambert(1.0), terms=1, resolution=4)
-    transport = dynamic.precompute(mesh, [white, white], size=SIZE, progress=False)
+    transport = dynamic.precompute_sets(mesh, [white, white], size=SIZE, progress=False)
     tensor = bounces.precompute(mesh, [white, white], edge=4, components=136, modes=96, size=8, progress=False)
     ones = Environment(jnp.ones((6, SIZE, SIZE, 1)))
     eye = jnp.array([0.0, 50.0, 0.0])
@@ -216,6 +216,6 @@ def test_what_does_not_fit_is_refused(transport, tensor, brdfs, unchecked):
     other = eqx.tree_at(lambda x: x.place, tensor, tensor.place[:-1])
     with pytest.raises(ValueError, match="have the transport's 136 vertices, got 135"):
         bounces.arriving(transport, other, bounces.light_side(tensor, lamp), now)
-    moved = dynamic.DynamicTransport(transport.region, transport.place, "another mesh")
+    moved = dynamic.SetTransport(transport.region, transport.place, "another mesh")
     with pytest.raises(ValueError, match="for the transport's mesh and regions, got one for others"):
         bounces.arriving(moved, tensor, bounces.light_side(tensor, lamp), now)

@@ -63,7 +63,7 @@ def family():
 
 @pytest.fixture(scope="module")
 def transport(mesh, family):
-    return dynamic.precompute(mesh, [family], size=SIZE, progress=False)
+    return dynamic.precompute_sets(mesh, [family], size=SIZE, progress=False)
 
 
 def color(transport, family, weight, light, eye=(0.5, 1.0, 3.0), diffuse=0.2, specular=1.0):

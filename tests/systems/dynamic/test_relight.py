@@ -48,7 +48,7 @@ def fixed():
 
 @pytest.fixture(scope="module")
 def transport(mesh, family, fixed):
-    return dynamic.precompute(mesh, [family, fixed], size=SIZE, progress=False)
+    return dynamic.precompute_sets(mesh, [family, fixed], size=SIZE, progress=False)
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def test_terms_carry_what_there_are_no_lobes_for(mesh, fixed, light):
     """A rough set by its tensor alone."""
     members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.9) for m in (0.6, 0.8)]
     tensor = dynamic.factor(members, None, ranks=(2, 24, 24), resolution=24)
-    transport = dynamic.precompute(mesh, [tensor, fixed], size=SIZE, progress=False)
+    transport = dynamic.precompute_sets(mesh, [tensor, fixed], size=SIZE, progress=False)
     assert transport.region[0].seen.pyramid.shape[1] == 6 * SIZE**2 // 8  # Bits alone.
     matter = dynamic.Material(jnp.array([1.0, 0.0]), jnp.zeros(1), jnp.ones(1))
     color = dynamic.radiance(transport, [tensor, fixed], [matter, None], light, eye=EYE)
@@ -117,7 +117,7 @@ def test_terms_of_the_remainder_change_little(mesh, transport, family, fixed, li
     error = []
     for each, made in (
         (family, transport),
-        (more, dynamic.precompute(mesh, [more, fixed], size=SIZE, progress=False)),
+        (more, dynamic.precompute_sets(mesh, [more, fixed], size=SIZE, progress=False)),
     ):
         color = np.asarray(dynamic.radiance(made, [each, fixed], [matter, None], light, eye=EYE))
         error.append(relative(color[ball], exact))
@@ -186,7 +186,7 @@ def test_a_region_that_does_not_change_has_no_machinery(transport):
 
 def test_a_stopped_precomputation_goes_on(mesh, family, fixed, transport, light, line, tmp_path):
     for _ in range(2):
-        again = dynamic.precompute(mesh, [family, fixed], size=SIZE, path=tmp_path, progress=False)
+        again = dynamic.precompute_sets(mesh, [family, fixed], size=SIZE, path=tmp_path, progress=False)
     materials = [material(line, 0.3), None]
     color, same = (dynamic.radiance(each, [family, fixed], materials, light, eye=EYE) for each in (transport, again))
     np.testing.assert_allclose(color, same, rtol=1e-6)
@@ -238,18 +238,18 @@ def test_what_does_not_fit_is_refused(transport, family, fixed, line, light, cha
 )
 def test_values_that_no_material_has_are_refused_with_the_region_and_the_field(values, message, unchecked):
     with pytest.raises(ValueError, match=message):
-        dynamic.relight.check_material(4, dynamic.Material(*values), 2, 3)
+        dynamic.set_relight.check_material(4, dynamic.Material(*values), 2, 3)
 
 
 def test_weights_of_a_navigation_and_traced_materials_pass(unchecked):
-    dynamic.relight.check_material(0, dynamic.Material([1 / 3 - 2e-6, 2 / 3 + 3e-6, -1e-6], 0, [0.2, 2, 0]), 3, 3)
+    dynamic.set_relight.check_material(0, dynamic.Material([1 / 3 - 2e-6, 2 / 3 + 3e-6, -1e-6], 0, [0.2, 2, 0]), 3, 3)
     plane = navigation.triangulate(np.random.default_rng(0).uniform(size=(5, 2)))
     for spot in np.random.default_rng(1).uniform(-0.5, 1.5, (8, 2)).astype(np.float32):
-        dynamic.relight.check_material(0, dynamic.Material(plane.weight(spot), 0.5, 0.5), 5, 3)
+        dynamic.set_relight.check_material(0, dynamic.Material(plane.weight(spot), 0.5, 0.5), 5, 3)
 
     def slope(value):
         matter = dynamic.Material(jnp.stack([value, -value]), value, -value)
-        dynamic.relight.check_material(0, matter, 2, 3)
+        dynamic.set_relight.check_material(0, matter, 2, 3)
         return matter.weight[0]
 
     assert jax.grad(slope)(3.0) == 1
@@ -280,6 +280,6 @@ def test_numbers_and_lists_make_a_material(transport, family, fixed, line, light
 
 def test_regions_without_a_brdf_are_refused(mesh, family):
     with pytest.raises(ValueError, match=r"one for each of the regions \[0, 1\], got 1"):
-        dynamic.precompute(mesh, [family], size=SIZE, progress=False)
+        dynamic.precompute_sets(mesh, [family], size=SIZE, progress=False)
     with pytest.raises(TypeError, match=r"must be made by|Type-check"):
-        dynamic.precompute(mesh, [family, Lambert(0.5)], size=SIZE, progress=False)
+        dynamic.precompute_sets(mesh, [family, Lambert(0.5)], size=SIZE, progress=False)

@@ -48,7 +48,7 @@ def materials(vertices, roughness):
 BRDFS = {
     "with a tensor": lambda: METALLIC_ROUGHNESS.tensor(),
     "with lobes alone": lambda: METALLIC_ROUGHNESS.tensor(12, None),
-    "with a tensor alone": lambda: dynamic.table.tabulate(
+    "with a tensor alone": lambda: dynamic.tabulate(
         METALLIC_ROUGHNESS.family, lobes=0, ranks=(6, 24, 24), knot=(METALLIC_ROUGHNESS.knot[10:],)
     ),
 }
@@ -57,8 +57,8 @@ BRDFS = {
 @pytest.fixture(scope="module", params=BRDFS)
 def system(request, seen):
     brdf = BRDFS[request.param]()
-    transport = dynamic.vertices.compress(seen, brdf, components=24, modes=128, keep=1024, progress=False)
-    return request.param, dynamic.vertex_system.DynamicSystem(transport, brdf)
+    transport = dynamic.compress(seen, brdf, components=24, modes=128, keep=1024, progress=False)
+    return request.param, dynamic.DynamicSystem(transport, brdf)
 
 
 def exact(seen, light, blend):
@@ -116,9 +116,9 @@ def test_points_with_a_tilted_normal_reflect_around_it(seen, system):
 
 
 def test_transport_of_another_brdf_is_refused(seen):
-    one, other = (dynamic.table.tabulate(prt.brdf.GGX(1.0, r), lobes=0, ranks=(1, 4, 4)) for r in (0.4, 0.6))
-    transport = dynamic.vertices.compress(seen, one, progress=False)
+    one, other = (dynamic.tabulate(prt.brdf.GGX(1.0, r), lobes=0, ranks=(1, 4, 4)) for r in (0.4, 0.6))
+    transport = dynamic.compress(seen, one, progress=False)
     with pytest.raises(ValueError, match="light factors differ"):
-        dynamic.vertex_system.DynamicSystem(transport, other)
+        dynamic.DynamicSystem(transport, other)
     with pytest.raises(ValueError, match="must have the transport's 4 light factors, got 0"):
-        dynamic.vertex_system.DynamicSystem(transport, dynamic.table.without_tensor(METALLIC_ROUGHNESS.lobes()))
+        dynamic.DynamicSystem(transport, dynamic.table.without_tensor(METALLIC_ROUGHNESS.lobes()))

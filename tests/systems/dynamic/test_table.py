@@ -31,7 +31,7 @@ def off(found, true):
 
 
 def tabulate(**options):
-    return dynamic.table.tabulate(family, resolution=RESOLUTION, knot=(ROUGH,), **options)
+    return dynamic.tabulate(family, resolution=RESOLUTION, knot=(ROUGH,), **options)
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def test_views_below_the_horizon_are_black(whole):
 )
 def test_impossible_sizes_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        dynamic.table.tabulate(Lambert(0.5), **options)
+        dynamic.tabulate(Lambert(0.5), **options)
 
 
 def test_parameters_are_required_and_no_more(whole):

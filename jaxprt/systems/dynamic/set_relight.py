@@ -22,8 +22,8 @@ from jaxprt.compile import isolated, jit
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
 from jaxprt.systems import bright_texels, protocol
-from jaxprt.systems.dynamic.brdf_set import DynamicBrdf, Mixed
-from jaxprt.systems.dynamic.transport import DynamicTransport, RegionTransport
+from jaxprt.systems.dynamic.brdf_set import BrdfSet, Mixed
+from jaxprt.systems.dynamic.set_transport import RegionTransport, SetTransport
 from jaxprt.systems.lobe import system as lobe
 from jaxprt.systems.lobe.blurred_light import LobeLight
 from jaxprt.systems.lobe.system import LobeView
@@ -65,7 +65,7 @@ class Material(eqx.Module):
             require.real(f"{name} of the material", getattr(self, name))
 
 
-class DynamicLight(eqx.Module):
+class SetLight(eqx.Module):
     """The light, projected for all regions.
 
     Attributes:
@@ -113,7 +113,7 @@ class RegionView(eqx.Module):
     points: Points | None = None
 
 
-class DynamicView(eqx.Module):
+class SetView(eqx.Module):
     """What depends on the view and all materials.
 
     Attributes:
@@ -126,8 +126,8 @@ class DynamicView(eqx.Module):
 
 
 def radiance(
-    transport: DynamicTransport,
-    brdfs: Sequence[DynamicBrdf | SeparableBrdf],
+    transport: SetTransport,
+    brdfs: Sequence[BrdfSet | SeparableBrdf],
     materials: Sequence[Material | None],
     light: Environment,
     *,
@@ -166,7 +166,7 @@ def radiance(
     return combine(transport, lit, view_side(transport, brdfs, materials, eye=eye), samples=samples)
 
 
-def light_side(transport: DynamicTransport, light: Environment, *, texels: int = 16) -> DynamicLight:
+def light_side(transport: SetTransport, light: Environment, *, texels: int = 16) -> SetLight:
     """Computes everything that depends on the light only.
 
     Args:
@@ -186,17 +186,17 @@ def light_side(transport: DynamicTransport, light: Environment, *, texels: int =
         blurred = lobe.prefilter(rest)
         blurred = LobeLight(blurred.pyramid, blurred.coefficient[:0], blurred.size)
     matte = tuple(bright_texels.irradiance(each.seen, texel, excess) for each in transport.region)
-    return DynamicLight(met, blurred, texel, excess, matte)
+    return SetLight(met, blurred, texel, excess, matte)
 
 
 def view_side(
-    transport: DynamicTransport,
-    brdfs: Sequence[DynamicBrdf | SeparableBrdf],
+    transport: SetTransport,
+    brdfs: Sequence[BrdfSet | SeparableBrdf],
     materials: Sequence[Material | None],
     *,
     eye: Float[Array, "3"],
     points: Sequence[Points] | None = None,
-) -> DynamicView:
+) -> SetView:
     """Computes everything that depends on the view and the materials, at the vertices or at points of each region.
 
     `radiance` gives the errors.
@@ -214,7 +214,7 @@ def view_side(
 
 
 @jit
-def _view_side(transport: DynamicTransport, brdfs, materials, eye: Array, points) -> DynamicView:
+def _view_side(transport: SetTransport, brdfs, materials, eye: Array, points) -> SetView:
     region = []
     several = [None] * len(transport.region) if points is None else points
     for own, surface, at in zip(transport.region, _mix(transport, brdfs, materials, several), several, strict=True):
@@ -226,12 +226,12 @@ def _view_side(transport: DynamicTransport, brdfs, materials, eye: Array, points
         looked = None if brdf.lobe is None else lobe.view_lobes(own.seen, brdf.lobe, eye=eye, points=at)
         factor = separable.view_tuple(brdf.terms, *place, eye) if brdf.terms.terms else None
         region.append(RegionView(surface, factor, looked, at))
-    return DynamicView(eye, tuple(region))
+    return SetView(eye, tuple(region))
 
 
 def mix(
-    transport: DynamicTransport,
-    brdfs: Sequence[DynamicBrdf | SeparableBrdf],
+    transport: SetTransport,
+    brdfs: Sequence[BrdfSet | SeparableBrdf],
     materials: Sequence[Material | None],
     *,
     points: Sequence[Points] | None = None,
@@ -250,7 +250,7 @@ def mix(
     return _mix(transport, brdfs, materials, [None] * len(transport.region) if points is None else points)
 
 
-def _mix(transport: DynamicTransport, brdfs, materials, points: Sequence[Points | None]) -> tuple[RegionBrdf, ...]:
+def _mix(transport: SetTransport, brdfs, materials, points: Sequence[Points | None]) -> tuple[RegionBrdf, ...]:
     result = []
     for own, brdf, material, at in zip(transport.region, brdfs, materials, points, strict=True):
         if isinstance(brdf, SeparableBrdf):
@@ -263,9 +263,7 @@ def _mix(transport: DynamicTransport, brdfs, materials, points: Sequence[Points 
 
 
 @partial(jit, static_argnames=("samples",))
-def combine(
-    transport: DynamicTransport, light: DynamicLight, view: DynamicView, *, samples: int = 1
-) -> Float[Array, "v c"]:
+def combine(transport: SetTransport, light: SetLight, view: SetView, *, samples: int = 1) -> Float[Array, "v c"]:
     """Radiance of a view under a light.
 
     Args:
@@ -294,7 +292,7 @@ def combine(
 
 
 @isolated
-def _mixed(brdf: DynamicBrdf, weight: Array) -> Mixed:
+def _mixed(brdf: BrdfSet, weight: Array) -> Mixed:
     return brdf.at(weight)
 
 
@@ -332,7 +330,7 @@ def _has_pyramid(region: RegionTransport) -> bool:
     return region.seen.pyramid.shape[1] > 6 * region.seen.size**2 // 8
 
 
-def _check_all(transport: DynamicTransport, brdfs: Sequence, materials: Sequence) -> None:
+def _check_all(transport: SetTransport, brdfs: Sequence, materials: Sequence) -> None:
     """Refuses BRDFs and materials that do not fit the regions."""
     count = len(transport.region)
     if len(brdfs) != count or len(materials) != count:
@@ -346,8 +344,8 @@ def _check_all(transport: DynamicTransport, brdfs: Sequence, materials: Sequence
 def _check(number: int, own: RegionTransport, brdf, material: Material | None, vertices: int) -> None:
     """Refuses a BRDF and a material that do not fit a region."""
     source = "jaxprt.dynamic.factor or jaxprt.separable.factor"
-    require.kind(f"the BRDF of region {number}", brdf, DynamicBrdf, SeparableBrdf, source=source)
-    changes = isinstance(brdf, DynamicBrdf)
+    require.kind(f"the BRDF of region {number}", brdf, BrdfSet, SeparableBrdf, source=source)
+    changes = isinstance(brdf, BrdfSet)
     terms = brdf.light_map.shape[0] + changes
     if terms != own.terms.terms or (changes and brdf.lobe is not None) != _has_pyramid(own):
         raise ValueError(
