@@ -120,7 +120,7 @@ HOST = {
     "systems.lobe.system.view_lobes": "gives indices beside weights, compiled in steps; combine has them all",
     "systems.lobe.widened": "views and sums of systems; tests/systems/lobe/test_widened.py",
     "systems.bounces.traced.is_sharp": "decides on the host",
-    "systems.bounces.traced.fraction": "NumPy on the host",
+    "systems.bounces.traced.is_traced": "NumPy on the host",
     "systems.standard": "reads files, on the host; the rest fits what is in them",
     "require.between": "checks a Python number",
     "require.finite": "checks values on the host",

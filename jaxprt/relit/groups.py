@@ -5,7 +5,7 @@ another in their group, and where each part stands is known on the host.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -21,7 +21,7 @@ from jaxprt.relit import channels
 from jaxprt.relit.channels import Appearance, Shading
 from jaxprt.scene import Environment, Mesh, PointLight
 from jaxprt.scene import origin as origins
-from jaxprt.scene.material_table import ROW, MaterialLook, MaterialTable, at_vertices
+from jaxprt.scene.material_table import MaterialLook, MaterialTable
 from jaxprt.scene.mesh import frames, join
 from jaxprt.scene.points import Points
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart
@@ -233,7 +233,7 @@ class Stage(eqx.Module):
         table: The materials of all parts.
         rough: The roughness of all parts alone, where JAX traces other parameters; None where the table is known.
         given: For each group, materials that users give at vertices; None without.
-        bend: Curvature of the radiance of each vertex, from `interpolation.curvature`.
+        bend: Curvature of the radiance of each vertex, from `curvature.of_part`.
         place: Where the vertices of the parts stand.
         samples: Number of sample points along the edge of each bright texel, for each part.
         sharp: Whether narrow lobes of each part are traced by rays.
@@ -300,27 +300,6 @@ class Stage(eqx.Module):
         look = look_at(self.table, self.rough, points)
         with compile_time(look, own, self.given[number], self.surfaces[number].scale):
             return material(self.surfaces[number], own, look, self.given[number])[0], own.tilted(look.normal)
-
-    def vertices(self, parts: Sequence[int]) -> Iterator[tuple[Int[np.ndarray, " p"], Points, Points]]:
-        """Vertices of some parts of one group in rows: their indices in the group, and as points of scene and group.
-
-        The last row repeats its last vertex.
-        """
-        pairs = [(self.place.first[part], self.place.start[part], np.arange(self.place.counts[part])) for part in parts]
-        scene, group = (np.concatenate([pair[i] + pair[2] for pair in pairs]).astype(np.int32) for i in (0, 1))
-        for first in range(0, len(scene), ROW):
-            row = np.minimum(np.arange(first, first + ROW), len(scene) - 1)
-            yield group[row], at_vertices(scene[row]), at_vertices(group[row])
-
-    def alone(self, number: int, look: MaterialLook, channel: int) -> MaterialLook:
-        """The materials with weight 1 of one channel of a group's BRDF, and 0 of the others."""
-        surface = self.surfaces[number]
-        if surface.scale is None:
-            return look._replace(emitted=0 * look.emitted)
-        coefficient = np.zeros((1, *look.coefficient.shape[1:]), look.coefficient.dtype)
-        coefficient[0, surface.term[channel]] = np.asarray(surface.scale)[channel]
-        wide = jnp.broadcast_to(jnp.asarray(coefficient), look.coefficient.shape)
-        return look._replace(coefficient=wide, emitted=0 * look.emitted)
 
 
 def light(surfaces: Sequence[Surface], bounces: GroupBounces | None, environment: Environment) -> SceneLight:

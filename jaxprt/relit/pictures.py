@@ -1,8 +1,8 @@
-"""Pictures of scenes. Radiance is computed at pixels where interpolation between vertices would be too inaccurate."""
+"""Pictures of scenes. Radiance is computed at the points that a picture shows, in rows of points of one group."""
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -17,21 +17,19 @@ from jaxprt import require
 from jaxprt.compile import Between, compile_time, finished, jit, known, promoted, put
 from jaxprt.image import raster
 from jaxprt.image.pixels import Pixels, visible_points
-from jaxprt.relit import canvas, interpolation, lamplight, shadows, tracing
+from jaxprt.relit import canvas, curvature, lamplight, shadows, tracing
 from jaxprt.relit.casting import caster
 from jaxprt.relit.groups import Arriving, Stage, Surface, look_at, sampled
 from jaxprt.relit.lamplight import LampLight
 from jaxprt.relit.shadows import TexelShares, TracedLight
-from jaxprt.relit.surface import Interpolated, Viewed, combine_interpolated, from_texels, lit, view, view_interpolated
+from jaxprt.relit.surface import Viewed, from_texels, lit, view
 from jaxprt.relit.tracing import Reflections
 from jaxprt.scene import Camera, Environment
-from jaxprt.scene.material_table import MaterialLook
 from jaxprt.scene.points import Points
 from jaxprt.systems.lamps import LampTransport
 
 # Samples that are drawn in each drawn pixel, and edge in drawn pixels of a pixel, by samples of a pixel.
 SAMPLES = {1: (1, 1), 4: (4, 1), 16: (4, 2)}
-_ERROR = 0.01  # RMS error of interpolated radiance above which radiance is computed at the pixels
 
 
 class Row(eqx.Module):
@@ -40,7 +38,6 @@ class Row(eqx.Module):
     Attributes:
         number: Index of the group.
         samples: Number of sample points along the edge of each bright texel.
-        interpolated: Whether radiance is interpolated between vertices, and not computed at the points.
         index: Indices of the points among all points of the picture; -1 is padding. Inside of `jax.jit` these are all
             rows of the group.
         kept: What does not depend on the light; None if it is computed anew for each light.
@@ -48,26 +45,7 @@ class Row(eqx.Module):
 
     number: int = eqx.field(static=True)
     samples: int = eqx.field(static=True)
-    interpolated: bool = eqx.field(static=True)
     index: Int[Array | np.ndarray, "*m p"]
-    kept: Viewed | Interpolated | None
-
-
-class VertexRow(eqx.Module):
-    """Vertices of a group from which one channel of its BRDF is interpolated.
-
-    Attributes:
-        number: Index of the group.
-        channel: Index of the channel.
-        vertex: Indices of the vertices in the group.
-        kept: What does not depend on the light; None if it is computed anew for each light.
-        points: The vertices as points of the scene and of the group.
-    """
-
-    number: int = eqx.field(static=True)
-    channel: int = eqx.field(static=True)
-    vertex: Int[np.ndarray, " p"]
-    points: tuple[Points, Points]
     kept: Viewed | None
 
 
@@ -82,7 +60,6 @@ class PictureView(eqx.Module):
         pixels: The points of the picture.
         ray: Unit direction in world space from the eye through the center of each drawn pixel.
         rows: The points in rows that are shaded together.
-        vertices: Vertices between which radiance is interpolated, in rows that are shaded together.
         reflected: Traced reflections of the points of sharp groups, in the order of their rows; None without.
         fold: Edge in drawn pixels of the squares that are averaged to one pixel of the picture.
         shadows: "rays" to trace the brightest texels of each light; "vertices" to interpolate them.
@@ -97,7 +74,6 @@ class PictureView(eqx.Module):
     pixels: Pixels
     ray: Float[Array, "h w 3"]
     rows: tuple[Row, ...]
-    vertices: tuple[VertexRow, ...]
     reflected: Reflections | None = None
     fold: int = eqx.field(static=True, default=1)
     shadows: str = eqx.field(static=True, default="vertices")
@@ -122,13 +98,12 @@ class PictureView(eqx.Module):
         light = _traced_light(self, environment)
         arriving = finished(self.arriving(environment, None if light is None else light.rest), between)
         lamps = lamplight.of(self.stage, self.pixels, self.camera.width) if self.lamp_rays else None
-        vertices = _vertices(self, arriving, lamps, between)
         reflected = iter(()) if self.reflected is None else iter(_reflections(self, environment, arriving, light))
         colors, sharp = environment.radiance.shape[-1], self.stage.sharp_groups
         recompute = not known(arriving, self.stage, self.camera)
         rows: list[tuple[Any, Array]] = []
         for row in self.rows:
-            color = _color(self, row, arriving, light, lamps, vertices, recompute=recompute)
+            color = _color(self, row, arriving, light, lamps, recompute=recompute)
             if row.number in sharp:
                 color = color + next(reflected)
             rows.append((row.index, finished(color, between)))
@@ -163,7 +138,6 @@ def _color(
     arriving: Arriving,
     light: TracedLight | None,
     lamps: LampLight | None,
-    vertices: dict[int, Array],
     *,
     recompute: bool,
 ) -> Float[Array, "*m p c"]:
@@ -175,17 +149,11 @@ def _color(
         arriving: The light that arrives at the scene, without what is taken out of traced texels.
         light: The light with its traced texels; None without.
         lamps: The lamps, if rays are traced to them.
-        vertices: Radiance of each channel at the vertices of groups that are interpolated.
         recompute: Whether derivatives compute again what depends on the view, which needs less memory.
     """
     surface = sampled(picture.stage.surfaces[row.number], row.samples)
     if row.index.ndim == 2:  # of a view that was made inside of `jax.jit`
         return _color_of_some(picture, row, arriving, light)
-    if row.interpolated:
-        kept = row.kept if isinstance(row.kept, Interpolated) else None
-        seen = _between(picture.stage, row, picture.pixels, picture.camera, lamps) if kept is None else kept
-        color = combine_interpolated(vertices[row.number], seen, lamp=None if seen.lamps is None else arriving.lamp)
-        return color if light is None else color + _from_texels(surface, row.samples, seen, light, row.index)
     if isinstance(row.kept, Viewed):
         return _lit(surface, row.samples, arriving.at(row.number), light, row.index, row.kept)
     shade = partial(_shaded, picture, surface, row, row.index, lamps)
@@ -215,9 +183,7 @@ def _lit(
     return color if light is None else color + _from_texels(surface, samples, seen, light, index)
 
 
-def _from_texels(
-    surface: Surface, samples: int, seen: Viewed | Interpolated, light: TracedLight, index: Any
-) -> Float[Array, "p c"]:
+def _from_texels(surface: Surface, samples: int, seen: Viewed, light: TracedLight, index: Any) -> Float[Array, "p c"]:
     """Radiance that points reflect from the traced texels of the light."""
     size = light.rest.radiance.shape[-2]
     return from_texels(surface, seen.sight, *light.row(index), size=size, samples=samples)
@@ -238,42 +204,8 @@ def _color_of_some(
     return jax.lax.map(some, row.index)
 
 
-def _between(stage: Stage, row: Row, pixels: Pixels, camera: Camera, lamps: LampLight | None) -> Interpolated:
-    """What does not depend on the light, for a row of points to which radiance is interpolated."""
-    points, on_group = canvas.points_of(pixels, stage.face, stage.shift, row.index)
-    look = look_at(stage.table, stage.rough, points)
-    transport, eye = None if lamps is None else lamps.row(row.number, row.index, on_group), jnp.asarray(camera.eye)
-    sharp = None if transport is None else stage.sharp_at(row.number, points)
-    given = stage.given[row.number]
-    return view_interpolated(stage.surfaces[row.number], on_group, look, eye, given=given, sharp=sharp, lamps=transport)
-
-
 def _points(picture: PictureView, index: Any) -> tuple[Points, Points]:
     return canvas.points_of(picture.pixels, picture.stage.face, picture.stage.shift, index)
-
-
-def _vertices(
-    picture: PictureView, arriving: Arriving, lamps: LampLight | None, between: Between
-) -> dict[int, Float[Array, "k v c"]]:
-    """Radiance of each channel at the vertices of each group, of the parts that are interpolated between them."""
-    stage, lit_rows = picture.stage, []
-    for row in picture.vertices:
-        seen = _seen_alone(stage, row, picture.camera, lamps) if row.kept is None else row.kept
-        surface, (direct, reflected, lamp) = stage.surfaces[row.number], arriving.at(row.number)
-        if seen.seen[2] is None:  # The lamps light the points of the picture.
-            surface, lamp = dataclasses.replace(surface, lit=None), None
-        lit_rows.append(finished(lit(surface, (direct, reflected, lamp), seen), between))
-    host = known(lit_rows)  # How many vertices are shaded depends on the view.
-    colors: dict[int, Any] = {}
-    for row, color in zip(picture.vertices, map(np.asarray, lit_rows) if host else lit_rows, strict=True):
-        shape = (stage.surfaces[row.number].channels, stage.place.size[row.number], color.shape[1])
-        if row.number not in colors:
-            colors[row.number] = (np if host else jnp).zeros(shape, color.dtype)
-        if host:
-            colors[row.number][row.channel, row.vertex] = color
-        else:
-            colors[row.number] = colors[row.number].at[row.channel, row.vertex].set(color)
-    return {number: put(color) for number, color in colors.items()}
 
 
 def make(
@@ -307,16 +239,13 @@ def make(
     samples, fold = SAMPLES[samples]
     camera = dataclasses.replace(camera, width=fold * camera.width, height=fold * camera.height)
     with compile_time(stage.mesh, camera, stage.bend) if stage.sharp_groups else contextlib.nullcontext():
-        pixels, rows, between_vertices = _placed(stage, camera, samples, between)
+        pixels, rows = _placed(stage, camera, samples, between)
     rays = isinstance(shadow, Environment) or shadow == "rays"
     lamps = lamplight.of(stage, pixels, camera.width) if rays else None
     complete, origins, sharp = [], [], stage.sharp_groups
     for row in rows:
         surface = sampled(stage.surfaces[row.number], row.samples)
         stores = keep and not isinstance(row.index, Tracer)
-        if stores and row.interpolated:
-            row = dataclasses.replace(row, kept=_between(stage, row, pixels, camera, lamps))
-            stores = False
         if stores or row.number in sharp:
             index = row.index if row.index.ndim == 1 else row.index[0]
             points, on_group = canvas.points_of(pixels, stage.face, stage.shift, index)
@@ -331,39 +260,13 @@ def make(
         complete.append(row)
     reflected = tracing.trace(stage, origins, jnp.asarray(camera.eye), keep=keep) if origins else None
     ray = raster.ray_direction(camera)
-    vertices = tuple(_vertex_rows(stage, between_vertices, camera, lamps, keep=keep))
     shares, way = None, "vertices"
     if isinstance(shadow, Environment):
         traced = shadows.trace(stage.whole, pixels, camera.width, shadow, keep=False)
         shares = None if traced is None else put(traced.shares)
     else:
         way = shadow
-    return PictureView(
-        stage, arriving, camera, pixels, ray, tuple(complete), vertices, reflected, fold, way, keep, shares, rays
-    )
-
-
-def _vertex_rows(
-    stage: Stage, interpolated: Sequence[Sequence[int]], camera: Camera, lamps: LampLight | None, *, keep: bool
-) -> Iterator[VertexRow]:
-    """The vertices of the parts of each group that are interpolated, in rows, once for each channel."""
-    for number, parts in enumerate(interpolated):
-        for vertex, points, own in stage.vertices(parts) if parts else ():
-            for channel in range(stage.surfaces[number].channels):
-                row = VertexRow(number, channel, vertex, (points, own), None)
-                yield dataclasses.replace(row, kept=_seen_alone(stage, row, camera, lamps)) if keep else row
-
-
-def _seen_alone(stage: Stage, row: VertexRow, camera: Camera, lamps: LampLight | None) -> Viewed:
-    """What does not depend on the light, at vertices with one channel of the BRDF alone.
-
-    Lamps are left out if rays from the points are traced to them.
-    """
-    points, own = row.points
-    alone = stage.alone(row.number, look_at(stage.table, stage.rough, points), row.channel)
-    surface = stage.surfaces[row.number]
-    surface = surface if lamps is None else dataclasses.replace(surface, lit=None)
-    return _seen(stage, surface, row.number, points, own, camera, alone)
+    return PictureView(stage, arriving, camera, pixels, ray, tuple(complete), reflected, fold, way, keep, shares, rays)
 
 
 def _seen(
@@ -373,11 +276,10 @@ def _seen(
     points: Points,
     own: Points,
     camera: Camera,
-    look: MaterialLook | None = None,
     lamps: LampTransport | None = None,
 ) -> Viewed:
-    """What does not depend on the light, for a row of points with their materials, or others."""
-    look = look_at(stage.table, stage.rough, points) if look is None else look
+    """What does not depend on the light, for a row of points with their materials."""
+    look = look_at(stage.table, stage.rough, points)
     given, sharp = stage.given[number], stage.sharp_at(number, points)
     # The view does not depend on the samples of bright texels.
     return view(sampled(surface, 1), own, look, jnp.asarray(camera.eye), given=given, sharp=sharp, lamps=lamps)
@@ -390,74 +292,32 @@ def _folded(picture: Float[Array, "h w c"], *, fold: int) -> Float[Array, "_ _ c
     return jnp.mean(picture.reshape(height // fold, fold, width // fold, fold, colors), (1, 3))
 
 
-def _placed(
-    stage: Stage, camera: Camera, samples: int, between: Between
-) -> tuple[Pixels, list[Row], tuple[tuple[int, ...], ...]]:
-    """The points of a picture in rows that are shaded alike, and the parts of each group that are interpolated."""
-    uneven = interpolation.uneven(stage.mesh, camera, stage.bend)
+def _placed(stage: Stage, camera: Camera, samples: int, between: Between) -> tuple[Pixels, list[Row]]:
+    """The points of a picture in rows that are shaded alike."""
+    uneven = curvature.uneven(stage.mesh, camera, stage.bend)
     occluder = None if stage.whole.opacity is None else caster(stage.whole).occluder
     shown = {"hidden": stage.hidden_faces, "occluder": occluder, "uneven": uneven, "between": between}
     pixels = visible_points(stage.mesh, camera, samples=samples, **shown)
     if not known(pixels, stage.mesh):
-        return pixels, list(_traced_rows(stage, pixels)), ((),) * len(stage.surfaces)
+        return pixels, list(_traced_rows(stage, pixels))
     triangle = np.asarray(pixels.triangle)
     owner = np.where(triangle >= 0, stage.part[stage.face[np.maximum(triangle, 0), 0]], -1)
-    interpolated = _interpolated(stage, owner, triangle, camera)
-    return pixels, list(_rows(stage, owner, interpolated)), interpolated
+    return pixels, list(_rows(stage, owner))
 
 
 def _traced_rows(stage: Stage, pixels: Pixels) -> Iterator[Row]:
     """The points in rows by group, inside of `jax.jit`: as many rows for each group as if it had all points."""
     first = jnp.asarray(stage.face)[jnp.maximum(pixels.triangle, 0), 0]
     owner = jnp.where(pixels.triangle >= 0, jnp.asarray(stage.part)[first], -1)
-    for number, own in enumerate(stage.place.parts):
-        samples = max(stage.samples[part] for part in own)
-        yield Row(number, samples, False, canvas.rows_of(jnp.isin(owner, jnp.asarray(own))), None)
+    for number, parts in enumerate(stage.place.parts):
+        samples = max(stage.samples[part] for part in parts)
+        yield Row(number, samples, canvas.rows_of(jnp.isin(owner, jnp.asarray(parts))), None)
 
 
-def _rows(stage: Stage, owner: np.ndarray, interpolated: Sequence[Sequence[int]]) -> Iterator[Row]:
-    """The points in rows by group, number of samples, and whether radiance is interpolated."""
-    for number, own in enumerate(stage.place.parts):
-        for at_vertices in (True, False):
-            rest = [part for part in own if (part in interpolated[number]) == at_vertices]
-            for samples in sorted({stage.samples[part] for part in rest}):
-                same = [part for part in rest if stage.samples[part] == samples]
-                for index in canvas.rows_of(np.isin(owner, same), owner=owner):
-                    yield Row(number, samples, at_vertices, index, None)
-
-
-def _interpolated(stage: Stage, owner: np.ndarray, triangle: np.ndarray, camera: Camera) -> tuple[tuple[int, ...], ...]:
-    """Parts of each group whose radiance is interpolated between vertices: where that is accurate, and less work.
-
-    Ideally diffuse groups count as accurate: their radiance is linear in the light that arrives at the vertices. Not
-    where users give materials at vertices or where there are normal maps, nor inside of `jax.jit`.
-    """
-    nothing = ((),) * len(stage.surfaces)
-    if not known(camera, stage.bend):
-        return nothing
-    place, seen = stage.place, np.bincount(owner[owner >= 0], minlength=len(stage.samples))
-    free = [given is None for given in stage.given]
-    channels = [surface.channels for surface in stage.surfaces]
-    may = [
-        free[group] and count > channels[group] * n
-        for count, group, n in zip(seen, place.group, place.counts, strict=True)
-    ]
-    if not any(may):
-        return nothing
-    wrong = np.asarray(interpolation.error(stage.mesh, jnp.asarray(camera.eye), stage.bend))
-    square = np.bincount(owner[owner >= 0], wrong[triangle[owner >= 0]] ** 2, len(seen))
-    matte = np.asarray([stage.surfaces[group].matte for group in place.group])
-    good = np.asarray(may) & (matte | (square <= _ERROR**2 * seen)) & ~stage.table.tilted[: len(may)]
-    result = []
-    for number, parts in zip(channels, place.parts, strict=True):
-        accurate = tuple(part for part in parts if good[part])
-        rest = set(parts) - set(accurate)
-        vertex_rows = number * _rows_for(place.counts, accurate)
-        saves = vertex_rows < _rows_for(seen, parts) - _rows_for(seen, rest)
-        result.append(accurate if saves else ())
-    return tuple(result)
-
-
-def _rows_for(count: Sequence[int] | np.ndarray, parts: Iterable[int]) -> int:
-    """Number of rows that some parts fill with their vertices or points."""
-    return -(-sum(int(count[part]) for part in parts) // canvas.ROW)
+def _rows(stage: Stage, owner: np.ndarray) -> Iterator[Row]:
+    """The points in rows by group and number of samples."""
+    for number, parts in enumerate(stage.place.parts):
+        for samples in sorted({stage.samples[part] for part in parts}):
+            same = [part for part in parts if stage.samples[part] == samples]
+            for index in canvas.rows_of(np.isin(owner, same), owner=owner):
+                yield Row(number, samples, index, None)

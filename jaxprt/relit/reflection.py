@@ -67,7 +67,7 @@ def make(
         The system of reflected light alone.
     """
     first = [shadings[own[0]] for own in place.parts]
-    of_group = [paths.factored(shading) for shading in first]
+    of_group = [paths.of_group([shadings[part] for part in own]) for own in place.parts]
     typical = [paths.typical(shading, of_group[group]) for shading, group in zip(shadings, place.group, strict=True)]
     region, members = _regions(place, typical)
     mesh = dataclasses.replace(
@@ -151,8 +151,9 @@ def is_sharp(shading: Shading, table: LobeBrdf | None) -> bool:
         return False
     if shading.table is not None:
         assert shading.blend is not None
-        weight = np.mean(np.asarray(shading.blend.weight, np.float64), (0, 2))
-        return shading.table.is_sharp(shading.smoothest, weight)
+        weight = np.mean(np.asarray(shading.blend.weight, np.float64), 0)
+        brightest = np.argmax(np.asarray(shading.scale) @ weight)
+        return shading.table.is_sharp(shading.smoothest, weight[:, brightest])
     return bool(traced.is_sharp(table))
 
 

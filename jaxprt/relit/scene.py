@@ -16,7 +16,7 @@ from jaxprt import require
 from jaxprt.brdf import grid
 from jaxprt.compile import Between, compile_time, known, promoted, put
 from jaxprt.image import automatic_exposure, pixels, raster
-from jaxprt.relit import channels, groups, interpolation, measuring, pictures, reflection, tracing
+from jaxprt.relit import channels, curvature, groups, measuring, pictures, reflection, tracing
 from jaxprt.relit import lamps as scene_lamps
 from jaxprt.relit.casting import caster
 from jaxprt.relit.channels import Appearance, Changeable, Shading, appearance
@@ -85,7 +85,7 @@ class RelitScene(System):
         camera: The first camera of the scene. If it has none, a camera that shows the whole scene from slightly above.
             Cameras, eyes and point lights are in the coordinates of the scene's file.
         curvature: How fast the radiance of each part varies with direction, from
-            `jaxprt.relit.interpolation.curvature`.
+            `jaxprt.relit.curvature.of_part`.
         lobes: BRDF, as lobes, of each group with parts whose reflections are too sharp for harmonics; None for others.
         points: Points on each part at which radiance is computed; None for the vertices.
         samples: Number of sample points along the edge of each bright texel, for each part.
@@ -463,10 +463,7 @@ class RelitScene(System):
     ) -> Float[Array, "h w c"]:
         """Renders the scene under an environment, in linear radiance.
 
-        Textures are evaluated at each pixel. Radiance of a part is computed at each pixel if interpolating it between
-        vertices would cause an error of more than 1 %, or if the part has more vertices than pixels; otherwise it is
-        interpolated. The error is estimated from the sharpness of the material and the size of the triangles.
-        Lambertian parts are always interpolated.
+        Materials are evaluated and radiance is computed at each pixel.
 
         Args:
             environment: One environment. It is also the background.
@@ -762,4 +759,4 @@ def traits(shading: Shading, system: System, lobes: LobeBrdf | None) -> tuple[fl
     size = system.visibility.size if isinstance(system, BrightTexels) else _TEXELS
     # Powers of two, so that few programs are compiled for parts of different roughness.
     samples = 1 << (samples_of(shading, size) - 1).bit_length()
-    return interpolation.curvature(shading, system), samples, reflection.is_sharp(shading, lobes)
+    return curvature.of_part(shading, system), samples, reflection.is_sharp(shading, lobes)

@@ -3,7 +3,7 @@
 `view` computes all that does not depend on the light, and `lit` the rest. Both are one program for each kind of group.
 """
 
-from functools import partial, reduce
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,7 +17,6 @@ from jaxprt.sphere import directions
 from jaxprt.systems import bright_texels
 from jaxprt.systems.bounces.traced import SharpPart
 from jaxprt.systems.lamps import LampTransport
-from jaxprt.systems.lamps.relight import summed
 from jaxprt.systems.lobe import widened
 from jaxprt.systems.protocol import Blend
 from jaxprt.visibility import picture_rays
@@ -54,23 +53,6 @@ class Viewed(eqx.Module):
     seen: tuple[PyTree, PyTree, PyTree]
     emitted: Float[Array, "p 3"]
     sight: Sight
-
-
-class Interpolated(eqx.Module):
-    """Points of a group to which radiance is interpolated from vertices, with all that does not depend on the light.
-
-    Attributes:
-        points: The points on the group.
-        emitted: Radiance that the points emit.
-        sight: Weights of the channels, and what single texels of the light need.
-        lamps: Radiance from each lamp of radiance 1, if rays from the points are traced to lamps. None if it is
-            interpolated from vertices too, or there are no lamps.
-    """
-
-    points: Points
-    emitted: Float[Array, "p 3"]
-    sight: Sight
-    lamps: Float[Array, "n p c"] | None = None
 
 
 @partial(kept, static=("glows",))
@@ -117,45 +99,6 @@ def lit(surface: Surface, arriving: tuple[PyTree, PyTree, PyTree], viewed: Viewe
         viewed: The result of `view`.
     """
     return combine(surface, arriving, viewed.seen, viewed.points, viewed.emitted)
-
-
-@kept
-def view_interpolated(
-    surface: Surface,
-    points: Points,
-    look: MaterialLook,
-    eye: Float[Array, "3"],
-    *,
-    given: Given | None,
-    sharp: Float[Array, " p"] | None = None,
-    lamps: LampTransport | None = None,
-) -> Interpolated:
-    """Points to which radiance is interpolated, with all that does not depend on the light; see `view`."""
-    points = points.tilted(look.normal)
-    blend, emitted = material(surface, points, look, given)
-    lit = None if lamps is None else _lit_at(surface, points, lamps, eye, blend, sharp)
-    return Interpolated(points, emitted, _sight(surface, points, eye, blend), lit)
-
-
-@kept
-def combine_interpolated(
-    vertices: Float[Array, "k v c"], points: Interpolated, *, lamp: Float[Array, "n 3"] | None = None
-) -> Float[Array, "p c"]:
-    """Colors of some points, interpolated from the radiance of each channel at the vertices.
-
-    Args:
-        vertices: Radiance of each channel at the vertices.
-        points: The points.
-        lamp: Radiance of each lamp, if `points` has lamps.
-    """
-    radiance = [points.points.carry(channel) for channel in vertices]
-    rest = points.emitted
-    if lamp is not None and points.lamps is not None:
-        rest = rest + summed(lamp, points.lamps)
-    if points.sight.blend is None:
-        return radiance[0] + rest
-    weight = jnp.moveaxis(points.sight.blend.weight, 1, 0)
-    return reduce(jnp.add, (color * own for color, own in zip(radiance, weight, strict=True))) + rest
 
 
 @partial(kept, static=("size", "samples"))

@@ -10,7 +10,7 @@ import pytest
 
 from jaxprt import Blend, bright_texels, harmonic, lobe
 from jaxprt.brdf import MetallicRoughness
-from jaxprt.relit import interpolation, paths
+from jaxprt.relit import curvature, paths
 from jaxprt.relit.channels import Shading
 from jaxprt.scene import builtin
 from jaxprt.sphere import hemisphere
@@ -200,9 +200,9 @@ def test_curvatures_are_those_of_the_brdf_between_knots(name):
     weight = np.array(MIXTURES[name])
     for place in between(METALLIC_ROUGHNESS, 0.28, SHARE, 0.93):
         part = shading(METALLIC_ROUGHNESS, place, weight)
-        exact = interpolation.curvature(part, object.__new__(LobeSystem))
+        exact = curvature.of_part(part, object.__new__(LobeSystem))
         assert METALLIC_ROUGHNESS.curvature(place, weight) == pytest.approx(exact, rel=CURVATURE)
-        low = interpolation.curvature(part, object.__new__(FourthDegree))
+        low = curvature.of_part(part, object.__new__(FourthDegree))
         assert METALLIC_ROUGHNESS.curvature(place, weight, 4) == pytest.approx(low, rel=CURVATURE)
 
 

@@ -93,20 +93,24 @@ def precompute(
     _check_sizes(bounces, least, components, modes, edge, size, patches)
     if lamps is not None:
         require.length("vertices of the lamps' transport", lamps.position, len(mesh.position))
-    bases = tuple(jax.tree.map(np.asarray, functions.basis(brdf)) for brdf in brdfs)
+    different = list({id(brdf): brdf for brdf in brdfs}.values())
+    basis = np.array([next(k for k, other in enumerate(different) if other is brdf) for brdf in brdfs])
+    bases = tuple(jax.tree.map(np.asarray, functions.basis(brdf)) for brdf in different)
     factor = tuple(each.factor if isinstance(each, BrdfSet) else functions.fixed_weights(each) for each in brdfs)
     if path is not None:
         os.makedirs(path, exist_ok=True)
     run = _Run(path, executor, progress)
     region = np.asarray(mesh.region)
     member = members.cluster(mesh.position, mesh.normal, clusters=max(1, round(len(region) / _MEMBERS)))
+    index = np.searchsorted(numbers, region)
     parts = {
         "bases": bases,
-        "response": _responses(mesh, bases, numbers, edge, lamps, run),
+        "basis": basis,
+        "response": _responses(mesh, bases, basis[index], edge, lamps, run),
         "lamps": 0 if lamps is None else lamps.lamps,
         "white": np.concatenate([_white(*each) for each in zip(factor, weights, strict=True)]),
         "scale": np.asarray(scales(factor)),
-        "region": np.searchsorted(numbers, region),
+        "region": index,
         "member": member,
     }
     sizes: dict[str, Any] = {"components": min(components, member.shape[1]), "modes": min(modes, 6 * edge * edge)}
@@ -130,7 +134,14 @@ def precompute(
     core_of_lamps = None
     if lamp is not None:
         weight, core_of_lamps = np.concatenate([weight, lamp[0]], -1), jax.device_put(lamp[1])
-    made = exchange.make(bases, function, weight, None if second is None else np.asarray(second.weight), edge, lamps)
+    made = exchange.make(
+        [bases[kind] for kind in basis],
+        function,
+        weight,
+        None if second is None else np.asarray(second.weight),
+        edge,
+        lamps,
+    )
     if second is not None and bounces != 2:
         worth += exchange.worth(made, job.white[function], function, brought_twice)
     if progress:
@@ -283,14 +294,17 @@ def _check_sizes(
 
 
 def _responses(
-    mesh: Mesh, bases: Sequence, numbers: np.ndarray, edge: int, lamps: LampTransport | None, run: _Run
+    mesh: Mesh, bases: Sequence, kind: np.ndarray, edge: int, lamps: LampTransport | None, run: _Run
 ) -> tuple[np.ndarray, ...]:
-    """Response of the light factors of each region to each texel of the environment, and to each lamp."""
+    """Response of the light factors of each basis to each texel of the environment, and to each lamp.
+
+    `kind` is the index of the basis of each vertex.
+    """
     result, count = [], 0 if lamps is None else lamps.lamps
-    for number, basis in zip(numbers.tolist(), bases, strict=True):
-        vertex = np.flatnonzero(np.asarray(mesh.region) == number)
+    for number, basis in enumerate(bases):
+        vertex = np.flatnonzero(kind == number)
         job = jobs.ResponseJob.make(mesh, None, vertex, _SEEN * edge, basis=basis, edge=edge)
-        found = run.compute(job, f"response_{number}", f"region {number}")["response"]
+        found = run.compute(job, f"response_{number}", f"response {number}")["response"]
         texels, terms = found.shape[1:]
         padded = np.zeros((shared_size(len(vertex)), terms, texels + count), found.dtype)
         padded[: len(vertex), :, :texels] = found.swapaxes(1, 2)

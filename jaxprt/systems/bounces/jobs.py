@@ -13,7 +13,6 @@ from jaxtyping import Array, Float, Float16
 
 from jaxprt import visibility
 from jaxprt.compile import jit, shared_size
-from jaxprt.decompose import eigen, tucker
 from jaxprt.files.arrays import Layout, sketch
 from jaxprt.sphere import cubemap, haar
 from jaxprt.systems.bounces import gather
@@ -21,7 +20,7 @@ from jaxprt.systems.separable import SeparableBrdf, clustered
 from jaxprt.visibility import members
 
 # Versions of the algorithms that make the results. A release that changes results increments one.
-ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "transfer": 2}
+ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "transfer": 3}
 DEGREE = gather.DEGREE  # degree of the harmonics that arrive
 _GROUPS = 128  # groups of rays that are summed by one program
 _AGAIN = 2  # edge of the light's faces for two bounces
@@ -63,9 +62,10 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
     """Light that surfaces of all regions send to the vertices of each cluster; see `blocks.Job`.
 
     Attributes:
-        bases: Functions of each region.
-        response: Responses of their light factors, at the vertices of each region, padded to a size that scenes share;
-            the light is the last axis: texels of the environment, and then lamps.
+        bases: Functions of the regions. Regions may share them.
+        basis: Index of the functions of each region.
+        response: For each of the bases, responses of its light factors at the vertices of all its regions, padded to a
+            size that scenes share; the light is the last axis: texels of the environment, and then lamps.
         lamps: Number of lamps.
         white: Weights of all functions with which the worth of a bounce is estimated.
         scale: Weights of all functions in the errors of decompositions.
@@ -75,6 +75,7 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
     """
 
     bases: tuple[SeparableBrdf, ...]
+    basis: np.ndarray
     response: tuple[np.ndarray, ...]
     lamps: int
     white: np.ndarray
@@ -87,7 +88,7 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
     @property
     def header(self) -> Mapping[str, Any]:
         """What the result depends on."""
-        maps = [basis.coordinates.__name__ for basis in self.bases]
+        maps = [self.bases[number].coordinates.__name__ for number in self.basis]
         made = visibility.blocks.fingerprint(*(np.asarray(each, np.int64) for each in (self.region, self.member)))
         kinds = self.response[0].shape[2]
         lamps = {"lamps": self.lamps} if self.lamps else {}
@@ -100,31 +101,39 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
         parts = {"white": self.white, "scale": self.scale}
         for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
             parts |= {f"light {number}": basis.light_map, f"view {number}": basis.view_map}
-            own = response[: np.sum(self.region == number)]
+            own = response[: len(self.vertices_of(number))]
             parts |= {f"response {number}": own.swapaxes(1, 2)}  # The order of axes in stores of earlier releases.
         return {**super().near, **{name: sketch(each) for name, each in parts.items()}}
+
+    def vertices_of(self, basis: int) -> np.ndarray:
+        """Vertices of all regions with the functions of a basis, in the order of its responses."""
+        return np.flatnonzero(self.basis[self.region] == basis)
 
     def arrived(self, part: np.ndarray) -> Float[np.ndarray, "b s q l"]:
         """Harmonics of the light that arrives at some vertices, before compression."""
         found = gather.rays(self.rays, self.start[part], self.frame[part, 2], self.frame, self.region, size=self.size)
         way = np.asarray(cubemap.direction(size=self.size), np.float32).reshape(-1, 3)
         share, cosine = gather.shares(self.frame[part, 2], size=self.size), gather.cosines(self.frame[part, 2])
-        result = []
-        for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
+        result, surfaces = [], {}
+        for number, kind in enumerate(self.basis.tolist()):
+            basis, response = self.bases[kind], self.response[kind]
             if number not in found:
                 shape = (len(part), cosine.shape[-1], basis.view_map.shape[-1], response.shape[2])
                 result.append(np.zeros(shape, np.float32))
                 continue
-            rays, own = found[number], np.flatnonzero(self.region == number)
-            local = np.zeros(len(self.region), np.int32)
-            local[own] = np.arange(len(own))
+            rays = found[number]
+            if kind not in surfaces:
+                vertex = self.vertices_of(kind)
+                local = np.zeros(len(self.region), np.int32)
+                local[vertex] = np.arange(len(vertex))
+                frame = np.pad(self.frame[vertex], ((0, len(response) - len(vertex)), (0, 0), (0, 0)))
+                surfaces[kind] = local, jax.device_put((response, frame, basis))
+            local, surface = surfaces[kind]
             # Groups of rays in blocks of one length, which regions and scenes share. Padding has zero weight.
             spare = -len(rays.owner) % _GROUPS
             owner, corner, weight, texel = (np.concatenate([x, np.zeros((spare, *x.shape[1:]), x.dtype)]) for x in rays)
             point = np.repeat(owner[:, None], texel.shape[1], 1)
             measure = gather.measures(cosine[point], texel, share[point, texel], size=self.size)
-            frame = np.pad(self.frame[own], ((0, len(response) - len(own)), (0, 0), (0, 0)))
-            surface = jax.device_put((response, frame, basis))
             shape = (shared_size(len(part)), cosine.shape[-1], basis.view_map.shape[-1], response.shape[2])
             arrived = jax.device_put(np.zeros(shape, response.dtype))
             for first in range(0, len(owner), _GROUPS):
@@ -147,8 +156,8 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
         """Components of light from lamps: weights of the vertices of a cluster, and the core. Nothing without lamps."""
         if not self.lamps:
             return {}
-        weight, core, _ = _along_vertices(jax.device_put(tensor * scale), components=self.components)
-        return {"lamp_weight": np.asarray(weight), "lamp": (np.asarray(core) / scale)[None]}
+        weight, core, _ = _along_vertices(tensor * scale, components=self.components)
+        return {"lamp_weight": weight, "lamp": (core / scale)[None]}
 
     def brought(self, tensor: Float[np.ndarray, "b l s *q"], part: np.ndarray, white: np.ndarray) -> np.ndarray:
         """Irradiance over pi at each vertex of a part, for given weights of functions, under uniform light."""
@@ -192,12 +201,12 @@ class TransferJob(_PathJob):
         whole = self.tensor(self.member[block])
         tensor, lamp = np.split(whole, [whole.shape[1] - self.lamps], 1)
         count, light, harmonic, functions = tensor.shape
-        flat = jax.device_put((tensor * self.scale).reshape(count, light, -1))
-        weight, core, mode, error = compress(flat, components=self.components, modes=self.modes)
-        core = np.asarray(core).reshape(1, *core.shape[:2], harmonic, functions) / self.scale
+        flat = (tensor * self.scale).reshape(count, light, -1)
+        weight, core, mode, error = compressed(flat, components=self.components, modes=self.modes)
+        core = core.reshape(1, *core.shape[:2], harmonic, functions) / self.scale
         white = self.brought(tensor, self.member[block], self.white)
         energy = np.sum(whole**2, (0, 1, 2))[None]
-        rows = {"weight": weight, "core": core, "mode": mode[None], "error": error[None], "energy": energy}
+        rows = {"weight": weight, "core": core, "mode": mode[None], "error": np.array([error]), "energy": energy}
         rows |= {"white": white, **self.lamp_rows(lamp, self.scale)}
         return {name: np.asarray(row) for name, row in rows.items()}, 0
 
@@ -235,19 +244,19 @@ class TransferJob(_PathJob):
         shape = (len(mode), 6, edge, fine // edge, edge, fine // edge, -1)
         coarse = mode.reshape(shape).sum((3, 5)).reshape(len(mode), 6 * edge * edge, -1)
         count = (coarse.shape[1] + self.lamps) * len(function)
-        counts = [np.sum(self.region == number) for number in range(len(self.bases))]
-        pairs = zip(counts, self.bases, strict=True)
-        response = [np.zeros((shared_size(int(n)), b.terms, count), np.float32) for n, b in pairs]
+        vertices = [self.vertices_of(number) for number in range(len(self.bases))]
+        pairs = zip(vertices, self.bases, strict=True)
+        response = [np.zeros((shared_size(len(v)), b.terms, count), np.float32) for v, b in pairs]
         local = np.zeros(len(self.region), np.int32)
-        for number, each in enumerate(counts):
-            local[self.region == number] = np.arange(each)
+        for vertex in vertices:
+            local[vertex] = np.arange(len(vertex))
         for cluster, (member, *parts) in enumerate(zip(self.member, weight, core, coarse, strict=True)):
             arriving = _expand(*map(jax.device_put, parts))
             if lamp is not None:
                 from_lamps = _expand(*jax.device_put((lamp[0][cluster], lamp[1][cluster], np.eye(self.lamps))))
                 arriving = jnp.concatenate([arriving, from_lamps.astype(arriving.dtype)], 1)
             for number, basis in enumerate(self.bases):
-                own = self.region[member] == number
+                own = self.basis[self.region[member]] == number
                 if own.any():
                     made = gather.respond_again(arriving, jnp.asarray(self.frame[member]), basis)
                     response[number][local[member[own]]] = np.asarray(made)[own].swapaxes(1, 2)
@@ -291,8 +300,8 @@ class AgainJob(_PathJob):
         tensor, lamp = np.split(tensor, [tensor.shape[1] - self.lamps], 1)
         scale = self.scale[self.function]
         both = scale[:, None] * scale
-        weight, core, error = _along_vertices(jax.device_put(tensor * both), components=self.components)
-        rows = {"weight": weight, "core": (np.asarray(core) / both)[None], "error": error[None]}
+        weight, core, error = _along_vertices(tensor * both, components=self.components)
+        rows = {"weight": weight, "core": (core / both)[None], "error": np.array([error])}
         white = self.brought(tensor, self.member[block], self.white[self.function])
         rows |= {"white": white, **self.lamp_rows(lamp, both)}
         return {name: np.asarray(row) for name, row in rows.items()}, 0
@@ -304,13 +313,13 @@ class AgainJob(_PathJob):
         return found.transpose(0, 3, 1, 4, 2)
 
 
-@functools.partial(jit, static_argnames=("components", "modes"))
-def compress(
-    tensor: Float[Array, "m l f"], *, components: int, modes: int
-) -> tuple[Float[Array, "m n"], Float16[Array, "e n f"], Float[Array, "l e"], Float[Array, ""]]:
+def compressed(
+    tensor: Float[np.ndarray, "m l f"], *, components: int, modes: int
+) -> tuple[Float[np.ndarray, "m n"], Float16[np.ndarray, "e n f"], Float[np.ndarray, "l e"], float]:
     """Decomposes the tensor of a cluster along the vertices, and then along the light.
 
-    It minimizes the squared error under light with the natural power spectrum.
+    It minimizes the squared error under light with the natural power spectrum. Eigenvectors are LAPACK's, on the host:
+    the matrices are small, and no program is compiled.
 
     Args:
         tensor: Light that arrives at each vertex from each texel, for all harmonics and functions f.
@@ -320,39 +329,58 @@ def compress(
     Returns:
         Weights of each vertex, cores scaled to a largest entry of 1, modes, and the relative error.
     """
-    count, texels, kinds = tensor.shape
-    size = haar.face_edge(texels)
-    importance = jnp.tile(haar.area(size=size).ravel(), 6)[:, None] ** clustered.SPECTRUM
-    wavelet = haar.forward(tensor.reshape(count, 6, size, size, kinds))
-    tensor = wavelet.reshape(count, texels, kinds) * importance.astype(tensor.dtype)
-    whole = jnp.vdot(tensor, tensor)
-    _, vertex, _ = eigen.symmetric(tucker.gram(tensor, mode=0), terms=components)
-    core = tucker.multiply(tensor, vertex, mode=0)
-    _, mode, _ = eigen.symmetric(tucker.gram(core, mode=1), terms=modes)
-    core = tucker.multiply(core, mode, mode=1)
-    left = jnp.maximum(whole - jnp.vdot(core, core), 0)
-    mode = haar.inverse((mode / importance).reshape(6, size, size, modes)).reshape(texels, modes)
-    error = jnp.sqrt(left / jnp.where(whole > 0, whole, 1))
+    forward, inverse = _spectrum(tensor.shape[1])
+    wavelet = np.matmul(forward.astype(tensor.dtype), tensor)
+    whole = _square(wavelet)
+    vertex, core = _principal(wavelet, components, axis=0)
+    mode, core = _principal(core, modes, axis=1)
+    left = max(whole - _square(core), 0)
     weight, core = _scaled(vertex, core)
-    return weight, core.swapaxes(0, 1), mode, error
+    error = math.sqrt(left / whole) if whole > 0 else 0.0
+    return weight, core.astype(np.float16).swapaxes(0, 1), inverse @ mode, error
 
 
-@functools.partial(jit, static_argnames=("components",))
-def _along_vertices(tensor: Array, *, components: int) -> tuple[Array, Array, Array]:
+def _along_vertices(
+    tensor: Float[np.ndarray, "m l *f"], *, components: int
+) -> tuple[Float[np.ndarray, "m n"], Float16[np.ndarray, "l n *f"], float]:
     """Decomposes a tensor along the vertices only, for light of few texels that all have the same weight."""
-    whole = jnp.vdot(tensor, tensor)
-    _, vertex, _ = eigen.symmetric(tucker.gram(tensor, mode=0), terms=components)
-    core = tucker.multiply(tensor, vertex, mode=0)
-    left = jnp.maximum(whole - jnp.vdot(core, core), 0)
+    whole = _square(tensor)
+    vertex, core = _principal(tensor, components, axis=0)
+    left = max(whole - _square(core), 0)
     weight, core = _scaled(vertex, core)
-    return weight, core.swapaxes(0, 1), jnp.sqrt(left / jnp.where(whole > 0, whole, 1))
+    return weight, core.astype(np.float16).swapaxes(0, 1), math.sqrt(left / whole) if whole > 0 else 0.0
 
 
-def _scaled(vertex: Array, core: Array) -> tuple[Array, Array]:
-    """Weights that carry the scale of the core, and the core in half precision with a largest entry of 1."""
-    size = jnp.max(jnp.abs(core), tuple(range(1, core.ndim)), initial=0)  # There may be no functions.
-    size = jnp.where(size > 0, size, 1)
-    return vertex * size, (core / size.reshape(-1, *[1] * (core.ndim - 1))).astype(jnp.float16)
+@functools.cache
+def _spectrum(texels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix from texels to wavelets under a natural power spectrum, and its inverse."""
+    size = haar.face_edge(texels)
+    importance = np.tile(np.asarray(haar.area(size=size), np.float64).ravel(), 6) ** clustered.SPECTRUM
+    with jax.ensure_compile_time_eval():
+        texel = np.asarray(haar.inverse(jnp.eye(texels).reshape(texels, 6, size, size, 1)), np.float64)
+    inverse = texel.reshape(texels, texels).T  # the wavelets are orthonormal
+    return importance[:, None] * inverse.T, inverse / importance
+
+
+def _principal(tensor: np.ndarray, count: int, *, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Leading left singular vectors of a mode of a tensor, and the tensor in their coordinates."""
+    flat = np.moveaxis(tensor, axis, 0)
+    rows = flat.reshape(len(flat), -1)
+    vector = np.linalg.eigh((rows @ rows.T).astype(np.float64))[1][:, : -count - 1 : -1].astype(tensor.dtype)
+    return vector, np.moveaxis((vector.T @ rows).reshape(count, *flat.shape[1:]), 0, axis)
+
+
+def _square(value: np.ndarray) -> float:
+    """Squared norm."""
+    flat = value.reshape(len(value), -1)
+    return float(np.sum(np.einsum("ij,ij->i", flat, flat), dtype=np.float64))
+
+
+def _scaled(vertex: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weights that carry the scale of the core, and the core with a largest entry of 1."""
+    size = np.max(np.abs(core), tuple(range(1, core.ndim)), initial=0)  # There may be no functions.
+    size = np.where(size > 0, size, 1)
+    return vertex * size, core / size.reshape(-1, *[1] * (core.ndim - 1))
 
 
 @jit

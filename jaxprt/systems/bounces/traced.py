@@ -15,7 +15,7 @@ from functools import partial, reduce
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxprt import require
@@ -29,8 +29,8 @@ from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.lobe.table import Lobes, traced_share
 from jaxprt.systems.protocol import Blend
 
-FEW = 0.55  # smallest traced fraction of what a BRDF's lobes reflect for which rays are traced
-_LITTLE = 0.01  # smallest traced fraction of all reflected light for which rays are traced
+FEW = 0.55  # traced fraction of what a BRDF's lobes reflect, below which rays bring nothing
+LEAST = 0.04  # what rays must bring, relative to all reflected light
 _GOLDEN = (5**0.5 - 1) / 2  # fraction of a turn from one ray to the next
 _TINY = 1e-12
 
@@ -155,21 +155,26 @@ def albedos(table: LobeBrdf) -> Float[Array, "3 c *k"]:
     return jnp.sum(every * area, tuple(range(-len(views), 0)))
 
 
-def fraction(traced: ArrayLike, glossy: ArrayLike, diffuse: ArrayLike) -> Float[np.ndarray, "*k"]:
-    """Fraction of the light reflected by lobes that would be traced; 0 if nearly all is reflected by the diffuse part.
+def is_traced(traced: ArrayLike, glossy: ArrayLike, diffuse: ArrayLike) -> Bool[np.ndarray, "*k"]:
+    """Whether rays bring enough: lobes are narrow, and reflect a large enough share of the light.
+
+    Rays bring the share of the traced lobes in all reflected light, times what sixteen harmonics lose of these lobes,
+    which is little if a smaller fraction than `FEW` of the lobes is traced.
 
     Args:
         traced: Albedo of the traced lobes.
         glossy: Albedo of all lobes.
         diffuse: Albedo of the diffuse part.
     """
-    traced, glossy, diffuse = (np.asarray(each) for each in (traced, glossy, diffuse))
-    return np.where(traced > _LITTLE * (glossy + diffuse), traced / np.maximum(glossy, _TINY), 0)
+    traced, glossy, diffuse = (np.asarray(albedo) for albedo in (traced, glossy, diffuse))
+    share = traced / np.maximum(glossy + diffuse, _TINY)
+    lost = (traced / np.maximum(glossy, _TINY) - FEW) / (1 - FEW)
+    return share * lost > LEAST
 
 
 def is_sharp(table: LobeBrdf) -> bool:
-    """Whether the traced fraction of a table's reflection is large enough, for any of its parameters, to trace rays."""
-    return bool(np.max(fraction(*np.asarray(jnp.sum(albedos(table), 1)))) > FEW)
+    """Whether rays bring enough for any parameter of a table."""
+    return bool(np.any(is_traced(*np.asarray(jnp.sum(albedos(table), 1)))))
 
 
 @jit

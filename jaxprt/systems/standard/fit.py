@@ -191,7 +191,7 @@ def tensor(made: Material, table: LobeBrdf) -> dict[str, np.ndarray]:
 
 
 def _zonal(brdf: Channels) -> Float[np.ndarray, "l k"]:
-    """Zonal harmonics of BRDF x cosine about the mirror direction; see `jaxprt.relit.interpolation.curvature`."""
+    """Zonal harmonics of BRDF x cosine about the mirror direction; see `jaxprt.relit.curvature.of_part`."""
     mirror = _VIEW * [-1, -1, 1]
     wi, area = hemisphere.arcs(jnp.asarray(mirror), rings=_RINGS, sectors=_SECTORS)
     value = np.asarray(brdf(wi, jnp.broadcast_to(jnp.asarray(_VIEW), wi.shape)), np.float64)

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from jaxprt import require
 from jaxprt.brdf import GGX, Charlie, CoatedModel, MetallicRoughness, UnderSheen, coat_reflectance, sheen_albedo
 from jaxprt.brdf.varying import Channels
+from jaxprt.systems.bounces import traced
 from jaxprt.systems.bounces.varying import Sent
 from jaxprt.systems.dynamic import DynamicBrdf
 from jaxprt.systems.harmonic import HarmonicBrdf
@@ -173,7 +174,8 @@ class LayeredTable(StandardTable):
         """Whether lobes of base and layer together are narrow enough to be traced."""
         weight = np.ones(2 * BASE + 1) if weight is None else np.asarray(weight, np.float64)
         rows = self._apart(log_roughness, weight)
-        return tables.is_traced(np.sum([table.albedos(place, part) for table, place, part in rows], 0))
+        albedo = np.sum([table.albedos(place, part) for table, place, part in rows], 0)
+        return bool(traced.is_traced(*albedo))
 
     def _apart(
         self, log_roughness: Any, weight: Float[np.ndarray, " k"]

@@ -157,7 +157,7 @@ class StandardTable:
         return _paths(self, _dtype())
 
     def curvature(self, log_roughness: float, weight: Float[np.ndarray, " k"], degree: int | None = None) -> float:
-        """RMS Laplacian of radiance over the mirror direction; see `jaxprt.relit.interpolation.curvature`.
+        """RMS Laplacian of radiance over the mirror direction; see `jaxprt.relit.curvature.of_part`.
 
         Args:
             log_roughness: Logarithm of the smallest roughness of a part. Between knots the logarithm of the curvature
@@ -193,9 +193,9 @@ class StandardTable:
 
         Args:
             log_roughness: Logarithm of the smallest roughness of a part.
-            weight: Mean weights of the channels, relative to `scale`, averaged over colors; None for ones.
+            weight: Mean weights of the channels, relative to `scale`, of one color or of their mean; None for ones.
         """
-        return is_traced(self.albedos(log_roughness, weight))
+        return bool(traced.is_traced(*self.albedos(log_roughness, weight)))
 
     def albedos(self, log_roughness: float, weight: Float[np.ndarray, " k"] | None = None) -> Float[np.ndarray, "3"]:
         """Albedos of traced lobes, of all lobes, and of the diffuse part; arguments as of `is_sharp`."""
@@ -217,11 +217,6 @@ METALLIC_ROUGHNESS = StandardTable("metallic_roughness")
 BLINN_PHONG = StandardTable("blinn_phong")
 COOK_TORRANCE = StandardTable("cook_torrance")
 SHEEN = StandardTable("sheen")
-
-
-def is_traced(albedo: Float[np.ndarray, "3"]) -> bool:
-    """Whether lobes are traced, given the albedos of traced lobes, of all lobes, and of the diffuse part."""
-    return float(traced.fraction(*albedo)) > traced.FEW
 
 
 def path(name: str) -> pathlib.Path:

@@ -1,7 +1,6 @@
-"""Estimates the error of interpolating radiance between vertices. Pictures use it to decide where to shade pixels.
+"""Curvature of radiance: how fast that of a part varies with direction, and which pixels need several points for it.
 
-The radiance of a glossy surface varies with the mirror direction of the eye. If it is interpolated linearly over a
-change of that direction by angle d, the RMS error over a triangle is d^2 / 12 times its second derivative.
+The radiance of a glossy surface varies with the mirror direction of the eye.
 """
 
 from collections.abc import Callable
@@ -24,15 +23,13 @@ from jaxprt.systems.protocol import System
 _DEGREE = 128  # degree of the harmonics that represent BRDFs
 _RINGS, _SECTORS = 96, 64
 _VIEW = np.array([0.6, 0.0, 0.8], np.float32)
-# In an isotropic field the squared second derivative along one direction is 3/8 of the squared Laplacian.
-_ALONG = np.sqrt(3 / 8) / 12
 _WITHIN = 24 * 0.02  # allowed relative difference of a pixel's mean from its center, times 24
 _RIM = 0.15  # allowed change of the cosine within a pixel, relative to the cosine plus this
 _MATTE = 0.83  # curvature up to which a surface counts as diffuse
 _EDGE_ON = 1e-6  # smallest area of a projected triangle in square pixels
 
 
-def curvature(shading: Shading, system: System) -> float:
+def of_part(shading: Shading, system: System) -> float:
     """RMS Laplacian of a part's radiance as a function of the mirror direction, divided by the RMS radiance.
 
     The light has the natural power spectrum C_l = (l + 1/2)^-2. The view is at 37 degrees from the normal. BRDF times
@@ -72,22 +69,6 @@ def curvature(shading: Shading, system: System) -> float:
 
 
 @jit
-def error(mesh: Mesh, eye: Float[Array, "3"], curvature: Float[Array, " v"]) -> Float[Array, " f"]:
-    """Relative error of radiance that is interpolated over each triangle, at most 1.
-
-    Args:
-        mesh: The triangles.
-        eye: Position of the viewer.
-        curvature: Result of `curvature` for the part of each vertex.
-    """
-    toward = directions.normalize(eye - mesh.position)
-    mirror = 2 * jnp.sum(mesh.normal * toward, -1, keepdims=True) * mesh.normal - toward
-    a, b, c = (mirror[mesh.face[:, k]] for k in range(3))
-    square = jnp.stack([jnp.sum((x - y) ** 2, -1) for x, y in ((a, b), (b, c), (c, a))])
-    return jnp.minimum(_ALONG * jnp.max(square, 0) * curvature[mesh.face[:, 0]], 1)
-
-
-@jit
 def uneven(mesh: Mesh, camera: Camera, curvature: Float[Array, " v"]) -> Bool[Array, " f"]:
     """Triangles whose radiance varies too much within a pixel to be shaded at one point of it.
 
@@ -98,7 +79,7 @@ def uneven(mesh: Mesh, camera: Camera, curvature: Float[Array, " v"]) -> Bool[Ar
     Args:
         mesh: The triangles.
         camera: The camera.
-        curvature: Result of `curvature` for the part of each vertex.
+        curvature: Result of `of_part` for the part of each vertex.
     """
     mesh, camera = jax.lax.stop_gradient((mesh, camera))
     x, y, q = raster.project(mesh.position, camera)
