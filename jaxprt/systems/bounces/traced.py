@@ -169,7 +169,7 @@ def is_traced(traced: ArrayLike, glossy: ArrayLike, diffuse: ArrayLike) -> Bool[
     traced, glossy, diffuse = (np.asarray(albedo) for albedo in (traced, glossy, diffuse))
     share = traced / np.maximum(glossy + diffuse, _TINY)
     lost = (traced / np.maximum(glossy, _TINY) - FEW) / (1 - FEW)
-    return share * lost > LEAST
+    return np.asarray(share * lost > LEAST)
 
 
 def is_sharp(table: LobeBrdf) -> bool:
