@@ -4,7 +4,7 @@ import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -93,34 +93,19 @@ def precompute(
     _check_sizes(bounces, least, components, modes, edge, size, patches)
     if lamps is not None:
         require.length("vertices of the lamps' transport", lamps.position, len(mesh.position))
-    different = list({id(brdf): brdf for brdf in brdfs}.values())
-    basis = np.array([next(k for k, other in enumerate(different) if other is brdf) for brdf in brdfs])
-    bases = tuple(jax.tree.map(np.asarray, functions.basis(brdf)) for brdf in different)
-    factor = tuple(each.factor if isinstance(each, BrdfSet) else functions.fixed_weights(each) for each in brdfs)
+    factor = tuple(brdf.factor if isinstance(brdf, BrdfSet) else functions.fixed_weights(brdf) for brdf in brdfs)
     if path is not None:
         os.makedirs(path, exist_ok=True)
     run = _Run(path, executor, progress)
-    region = np.asarray(mesh.region)
-    member = members.cluster(mesh.position, mesh.normal, clusters=max(1, round(len(region) / _MEMBERS)))
-    index = np.searchsorted(numbers, region)
-    parts = {
-        "bases": bases,
-        "basis": basis,
-        "response": _responses(mesh, bases, basis[index], edge, lamps, run),
-        "lamps": 0 if lamps is None else lamps.lamps,
-        "white": np.concatenate([_white(*each) for each in zip(factor, weights, strict=True)]),
-        "scale": np.asarray(scales(factor)),
-        "region": index,
-        "member": member,
-    }
-    sizes: dict[str, Any] = {"components": min(components, member.shape[1]), "modes": min(modes, 6 * edge * edge)}
-    job = jobs.TransferJob.make(mesh, None, None, size, **parts, **sizes)
-    found = run.compute(job, "clusters", "bounce")
+    white = np.concatenate([_white(*pair) for pair in zip(factor, weights, strict=True)])
+    parts = {"lamps": 0 if lamps is None else lamps.lamps, "white": white, "scale": np.asarray(scales(factor))}
+    sizes = {"components": components, "modes": min(modes, 6 * edge * edge), "size": size}
+    job = _job(mesh, brdfs, np.searchsorted(numbers, mesh.region), edge, lamps, run, parts, sizes)
+    found, member = run.compute(job, "clusters", "bounce"), job.member
     contribution = _contributions(found["energy"], job.scale)
     function = np.flatnonzero(contribution >= least)
     worth = [_rms(found["white"])]
-    weight, core = found["weight"].reshape(*member.shape, -1), found["core"][..., function]
-    lamp = None
+    weight, core, lamp = found["weight"].reshape(*member.shape, -1), found["core"][..., function], None
     if lamps is not None:
         lamp = found["lamp_weight"].reshape(*member.shape, -1), found["lamp"][..., function]
     job, parts = job.without_response(), None
@@ -131,27 +116,38 @@ def precompute(
         second, brought_twice = _second(again, member, job.white[function], least, run)
         worth.append(_rms(brought_twice))
     exchange = _Exchange(mesh, job, patches, None if bounces == ALL else int(bounces), run)
-    core_of_lamps = None
-    if lamp is not None:
-        weight, core_of_lamps = np.concatenate([weight, lamp[0]], -1), jax.device_put(lamp[1])
-    made = exchange.make(
-        [bases[kind] for kind in basis],
-        function,
-        weight,
-        None if second is None else np.asarray(second.weight),
-        edge,
-        lamps,
-    )
+    whole = weight if lamp is None else np.concatenate([weight, lamp[0]], -1)
+    made = exchange.make(function, whole, None if second is None else np.asarray(second.weight), edge, lamps)
     if second is not None and bounces != 2:
         worth += exchange.worth(made, job.white[function], function, brought_twice)
     if progress:
         _tell(contribution, function, worth, second, bounces)
-    rows = (members.places(member), job.region.astype(np.int32), areas(mesh).astype(weight.dtype))
-    arrays = [jax.device_put(each) for each in (weight, core, found["mode"], *rows, function)]
-    judged = jnp.asarray(found["error"]), jnp.asarray(worth, arrays[0].dtype)
+    rows = (members.places(member), job.region.astype(np.int32), areas(mesh).astype(whole.dtype))
+    arrays = [jax.device_put(column) for column in (whole, core, found["mode"], *rows, function)]
     made_of = {"factor": factor, "second": second, "mesh": visibility.blocks.scene_key(mesh), "patches": made}
-    made_of["lamp"] = core_of_lamps
-    return TransferTensor(*arrays, **made_of, error=judged[0], worth=judged[1])
+    made_of |= {"lamp": None if lamp is None else jax.device_put(lamp[1]), "error": jnp.asarray(found["error"])}
+    return TransferTensor(*arrays, **made_of, worth=jnp.asarray(worth, arrays[0].dtype))
+
+
+def _job(
+    mesh: Mesh,
+    brdfs: Sequence[BrdfSet | SeparableBrdf],
+    region: np.ndarray,
+    edge: int,
+    lamps: LampTransport | None,
+    run: "_Run",
+    parts: dict[str, Any],
+    sizes: dict[str, int],
+) -> jobs.TransferJob:
+    """The job of one bounce, with responses of all vertices. Regions with one BRDF share its functions."""
+    different = list({id(brdf): brdf for brdf in brdfs}.values())
+    basis = np.array([next(k for k, other in enumerate(different) if other is brdf) for brdf in brdfs])
+    bases = tuple(jax.tree.map(np.asarray, functions.basis(brdf)) for brdf in different)
+    member = members.cluster(mesh.position, mesh.normal, clusters=max(1, round(len(region) / _MEMBERS)))
+    response = _responses(mesh, bases, basis[region], edge, lamps, run)
+    parts = parts | {"bases": bases, "basis": basis, "response": response, "region": region, "member": member}
+    size, components, modes = sizes["size"], min(sizes["components"], member.shape[1]), sizes["modes"]
+    return jobs.TransferJob.make(mesh, None, None, size, components=components, modes=modes, **parts)
 
 
 class _Run(NamedTuple):
@@ -187,7 +183,6 @@ class _Exchange(NamedTuple):
 
     def make(
         self,
-        bases: Sequence[SeparableBrdf],
         function: np.ndarray,
         weight: np.ndarray,
         again: np.ndarray | None,
@@ -211,8 +206,9 @@ class _Exchange(NamedTuple):
             return mean.product(weight.reshape(-1, weight.shape[-1])[place], cosine)
 
         strength, first = [], 0
-        for basis in bases:
-            own = np.asarray(functions.albedo(basis))
+        albedo = [np.asarray(functions.albedo(basis)) for basis in self.job.bases]
+        for kind in self.job.basis:
+            own = albedo[kind]
             kept = np.isin(np.arange(first, first + len(own)), function)
             strength.append(jnp.asarray(np.where(kept, own, 0)))
             first += len(own)
