@@ -25,9 +25,9 @@ _PLACES = 4  # along the edge of a pixel, at which sides are looked at
 
 
 class View:
-    """Surfaces that Mitsuba sees from one camera, in direct light."""
+    """Surfaces that Mitsuba sees from one camera."""
 
-    def __init__(self, surfaces: Sequence[Surface], light: pathlib.Path, camera: Any, *, model: str):
+    def __init__(self, surfaces: Sequence[Surface], light: pathlib.Path, camera: Any, *, model: str, bounces: int = 0):
         """Loads the scene.
 
         Args:
@@ -35,6 +35,7 @@ class View:
             light: The environment file.
             camera: A `jaxprt.Camera`.
             model: One of `MODELS`.
+            bounces: How often surfaces reflect light onto each other.
         """
         import mitsuba
 
@@ -42,10 +43,13 @@ class View:
         self._mitsuba = mitsuba
         sensor = path_tracing.sensor(mitsuba, camera)
         sensor["film"]["pixel_format"] = "rgba"
-        world = {"type": "scene", "sensor": sensor, "light": emitter(mitsuba, light)}
+        world = {"type": "scene", "sensor": sensor} | emitter(mitsuba, light)
         self._world = mitsuba.load_dict(world | _shapes(mitsuba, surfaces, model))
         covering = all(surface.material.opaque for surface in surfaces)
-        direct = {"type": "direct"} if covering else {"type": "volpath", "max_depth": 2, "rr_depth": 100}
+        paths = {"max_depth": 2 + bounces, "rr_depth": 1000}
+        direct = {"type": "volpath", **paths}
+        if covering:
+            direct = {"type": "path", **paths} if bounces else {"type": "direct"}
         self._hidden = mitsuba.load_dict({**direct, "hide_emitters": True})
         self._dark = None
         if any(surface.material.emissive.any() for surface in surfaces):
@@ -99,11 +103,13 @@ def _unlit(surface: Surface) -> Surface:
 
 
 def emitter(mitsuba: Any, path: pathlib.Path) -> dict[str, Any]:
-    """The light of a latitude-longitude file, constant over each of its texels.
+    """The light of a latitude-longitude file, constant over each of its texels; none if it is black.
 
     Mitsuba interpolates between texels, and its first and last rows are the poles. Therefore texels are repeated.
     """
     pixels = np.maximum(np.asarray(files.read_image(str(path))[0], np.float32), 0)
+    if not pixels.any():
+        return {}
     pixels = np.repeat(pixels, 3, -1) if pixels.shape[-1] == 1 else pixels[..., :3]
     height, width = pixels.shape[:2]
     if width != 2 * height:
@@ -111,7 +117,8 @@ def emitter(mitsuba: Any, path: pathlib.Path) -> dict[str, Any]:
     rows = max(_HEIGHT, 2 * height)
     row = np.minimum(np.linspace(0, height, rows).astype(int), height - 1)
     column = ((np.arange(2 * rows) + 0.5) / (2 * rows) * width).astype(int)
-    return {"type": "envmap", "bitmap": mitsuba.Bitmap(np.ascontiguousarray(pixels[row][:, column]))}
+    bitmap = mitsuba.Bitmap(np.ascontiguousarray(pixels[row][:, column]))
+    return {"light": {"type": "envmap", "bitmap": bitmap}}
 
 
 def _sides(surface: Surface) -> list[Surface]:

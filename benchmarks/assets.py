@@ -2,12 +2,15 @@
 
     python -m benchmarks.assets FOLDER... [--quick] [--only TEXT] [--light FILE] [--edge N] [--samples N]
         [--model NAME] [--warm] [--limit SECONDS] [--store FOLDER] [--pictures FOLDER] [--table FILE] [--output FILE]
+        [--dark] [--bounces]
 
 Every file is relit by README's lines, with their defaults, in a process of its own with a time limit. It starts without
 compiled programs, unless `--warm` is given. The judge is Mitsuba in another process: `benchmarks.asset_files` reads the
 file, and `benchmarks.asset_scenes` writes its materials and the environment file down for Mitsuba, none of it with
 jaxprt's code. Only the camera is jaxprt's: the first of the file, or the default one. Light is direct, as it is by
-default. `--model principled` judges by Mitsuba's own BSDF in place of the formula of the glTF specification.
+default; with `--bounces` it is reflected as often as that brings something, 39 times by Mitsuba. With `--dark` it is
+that of the file's lamps alone. `--model principled` judges by Mitsuba's own BSDF in place of the formula of the glTF
+specification.
 
 Each file is one line. `error` is relative L2 over the pixels that surfaces fill, without Mitsuba's noise, the largest
 of the lights; `errors`, `flips`, `biases` and `noises` have all of them. Errors far below the noise, as of glints of a
@@ -47,6 +50,7 @@ from benchmarks import asset_files, asset_scenes, denoised, harness
 EDGE, SAMPLES = 512, 256
 LIGHTS = "polyhaven_sunrise_1k.exr", "polyhaven_courtyard_1k.exr"  # a sun, and a soft light
 NOISE, BLOCKS = 0.015, 16  # relative L2 of Mitsuba's pictures at which to stop, and so many times the samples at most
+BOUNCES = 39  # of Mitsuba, with `--bounces`
 LIMIT = 900.0  # seconds of the clock
 LARGE = 0.1  # error of which something should warn
 SUFFIXES = ".glb", ".gltf", ".obj"
@@ -63,6 +67,8 @@ def main(options: Sequence[str] | None = None) -> None:
         "--edge", type=int, metavar="N", default=EDGE, help=f"pixels along an edge; {EDGE} if not given"
     )
     parser.add_argument("--samples", type=int, metavar="N", default=SAMPLES, help="of Mitsuba's pictures, at least")
+    parser.add_argument("--dark", action="store_true", help="the light of lamps alone")
+    parser.add_argument("--bounces", action="store_true", help="light that surfaces reflect onto each other too")
     parser.add_argument("--model", choices=asset_scenes.MODELS, default=asset_scenes.MODELS[0], help="Mitsuba's BSDF")
     parser.add_argument("--warm", action="store_true", help="use and keep compiled programs")
     parser.add_argument("--limit", type=float, metavar="SECONDS", default=LIMIT, help="of each process")
@@ -78,6 +84,7 @@ def main(options: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = pathlib.Path(temporary)
         files, lights, options_of = _quick(folder) if arguments.quick else _asked(parser, arguments)
+        lights = [_black(folder)] if arguments.dark else lights
         lines = []
         for path in files:
             line = judge(path, lights, folder, **options_of)
@@ -96,8 +103,16 @@ def _asked(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> tu
     missing = [str(path) for path in lights if not path.is_file()]
     if missing or not files:
         parser.error(f"missing: {', '.join(missing)}" if missing else "no glTF or OBJ file in these folders")
-    names = ("edge", "samples", "model", "warm", "limit", "store", "pictures")
+    names = ("edge", "samples", "model", "warm", "limit", "store", "pictures", "bounces")
     return files, lights, {name: getattr(arguments, name) for name in names}
+
+
+def _black(folder: pathlib.Path) -> pathlib.Path:
+    """A light file without light."""
+    from jaxprt import files
+
+    files.write_exr(folder / "dark.exr", np.zeros((16, 32, 3), np.float32))
+    return folder / "dark.exr"
 
 
 def _quick(folder: pathlib.Path) -> tuple[list, list, dict[str, Any]]:
@@ -111,7 +126,7 @@ def _quick(folder: pathlib.Path) -> tuple[list, list, dict[str, Any]]:
     radiance[3:5, 18:22] = 20.0
     files.write_exr(light, radiance)
     options = {"edge": 32, "samples": 64, "model": asset_scenes.MODELS[0], "warm": True, "limit": LIMIT, "size": 16}
-    return [file], [light], {**options, "store": None, "pictures": folder}
+    return [file], [light], {**options, "store": None, "pictures": folder, "bounces": False}
 
 
 def found(folders: Sequence[pathlib.Path]) -> list[pathlib.Path]:
@@ -135,6 +150,7 @@ def judge(
     limit: float,
     store: pathlib.Path | None,
     pictures: pathlib.Path | None,
+    bounces: bool,
     size: int | None = None,
 ) -> dict[str, Any]:
     """The line of a file.
@@ -151,10 +167,12 @@ def judge(
         limit: Seconds of the clock for each process.
         store: A folder that keeps Mitsuba's pictures.
         pictures: A folder for sheets.
+        bounces: Whether surfaces reflect light onto each other, as often as that brings something.
         size: Texels along an edge of the light; None for the default.
     """
     start = time.perf_counter()
     request = {"path": path, "lights": lights, "edge": edge, "size": size, "samples": samples, "model": model}
+    request["bounces"] = bounces
     ours, reason = in_process("relight", request, folder, warm=warm, limit=limit)
     line = {"benchmark": "assets", "case": "/".join(path.parts[-2:]), "compile_seconds": None, "error": None}
     line |= {"bytes": path.stat().st_size, "seconds": time.perf_counter() - start, "loaded": ours is not None}
@@ -293,8 +311,10 @@ def relight(request: dict[str, Any]) -> dict[str, Any]:
         lights = [prt.load_environment(path, size=size or 64) for path in request["lights"]]
     with warnings.catch_warnings(record=True) as raised, tempfile.TemporaryDirectory() as store:
         warnings.simplefilter("always")
-        scene = prt.load_scene(request["path"])
-        relit = prt.precompute(scene, system="lobe", path=f"{store}/scene.prt", progress=False, size=size)
+        scene, options = prt.load_scene(request["path"]), {"size": size}
+        if request["bounces"]:
+            options["bounces"] = "all"
+        relit = prt.precompute(scene, system="lobe", path=f"{store}/scene.prt", progress=False, **options)
         precomputed = _processor_seconds()
         camera = dataclasses.replace(relit.camera, width=request["edge"], height=request["edge"])
         pictures = [np.asarray(relit.picture(lights[0], camera))]
@@ -326,7 +346,8 @@ def trace(request: dict[str, Any]) -> dict[str, Any]:
     for light in request["lights"]:
         code = "".join(inspect.getsource(module) for module in (asset_files, asset_scenes))
         camera = [np.asarray(value).tolist() for value in vars(request["camera"]).values()]
-        what = pickle.dumps((surfaces, light.read_bytes(), camera, request["samples"], request["model"], code))
+        asked = [request[name] for name in ("samples", "model", "bounces")]
+        what = pickle.dumps((surfaces, light.read_bytes(), camera, asked, code))
         path = request["store"] and request["store"] / f"{hashlib.sha256(what).hexdigest()}.npz"
         if path is None or not path.is_file():
             both, sides = _rendered(surfaces, light, request)
@@ -342,7 +363,8 @@ def trace(request: dict[str, Any]) -> dict[str, Any]:
 
 def _rendered(surfaces, light: pathlib.Path, request: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """Two pictures [2 h w 4], and the pixels [2 h w] of `asset_scenes.View.sides`."""
-    view = asset_scenes.View(surfaces, light, request["camera"], model=request["model"])
+    bounces = BOUNCES * request["bounces"]
+    view = asset_scenes.View(surfaces, light, request["camera"], model=request["model"], bounces=bounces)
     sides = np.stack(view.sides())
     total, noise, blocks = np.zeros(()), np.inf, 0
     while noise > NOISE and blocks < BLOCKS:
