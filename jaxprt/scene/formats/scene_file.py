@@ -3,6 +3,7 @@
 import pathlib
 import warnings
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from jaxprt import require
@@ -12,6 +13,7 @@ from jaxprt.scene.mesh import Mesh, from_file
 from jaxprt.scene.scene import Scene
 
 
+@require.arguments(path=partial(require.path, "path"))
 def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
     """Loads a mesh from a PLY, OBJ, STL, OFF, GLB or glTF file. `load_scene` also reads materials and images.
 
