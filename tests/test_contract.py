@@ -242,7 +242,6 @@ HOST = {
     "scene.subdivision": "divides meshes on the host",
     "scene.light_samples": "NumPy on the host",
     "scene.builtin": "builds meshes and lights",
-    "scene.shapes": "builds meshes",
     "benchmarks.published.interiors": "builds meshes",
     "scene.camera.orbit": "measures a mesh on the host",
     "scene.environment.load_environment": "reads a file",

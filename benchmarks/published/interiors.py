@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxprt.scene import builtin
+from jaxprt.scene.builtin import SurfacePatch, assemble, curve, patch, sweep
 from jaxprt.scene.mesh import Mesh, bounds, grid_face, join, split
-from jaxprt.scene.shapes import Part, assemble, curve, patch, sweep
 
 _CELL = 0.1  # spacing of the room's vertices; floor and walls share vertices where they meet
 _GAP = 0.003  # gap between objects in the room and on the table, about 5e-4 of the diagonals
@@ -138,14 +138,14 @@ def ring(*, spacing: float = 1.0) -> Mesh:
     return join([assemble(_band(profile, round(_RING_SECTORS / spacing), _RING_STEP * spacing)), assemble(table)])
 
 
-def _reveal() -> list[Part]:
+def _reveal() -> list[SurfacePatch]:
     """The four sides of the window's reveal."""
     (y0, z0), (y1, z1) = _WINDOW
     inside = np.array([[_WALLS[0][0], y, z] for y, z in ((y0, z0), (y0, z1), (y1, z1), (y1, z0))])
     return _between(inside, inside - [_REVEAL, 0, 0])
 
 
-def _rug() -> list[Part]:
+def _rug() -> list[SurfacePatch]:
     """The rug with its hem, whose rim has the same positions as the floor's vertices."""
     (x0, z0), (x1, z1) = _RUG
     rim = np.array([[x0, 0, z1], [x1, 0, z1], [x1, 0, z0], [x0, 0, z0]])
@@ -153,7 +153,7 @@ def _rug() -> list[Part]:
     return [_panel([[top[3], top[2]], [top[0], top[1]]]), *_between(top, rim)]
 
 
-def _sofa() -> list[Part]:
+def _sofa() -> list[SurfacePatch]:
     """The sofa's base, arms, back and two seats, against the back wall."""
     inner = 0.9 - _CLEAR
     arms = [_block((x, _GAP, -1.89), (x + 0.2 - 2 * _CLEAR, 0.58, -1.01), 0.04) for x in (-1.09, 0.91)]
@@ -163,7 +163,7 @@ def _sofa() -> list[Part]:
     return [base, back, *arms, *seats]
 
 
-def _cushions() -> list[Part]:
+def _cushions() -> list[SurfacePatch]:
     """Two cushions that lean against the sofa's back."""
     parts = []
     for x, lean, turn in ((-0.6, 0.3, 0.25), (0.58, 0.24, -0.2)):
@@ -178,7 +178,7 @@ def _cushions() -> list[Part]:
     return parts
 
 
-def _table() -> list[Part]:
+def _table() -> list[SurfacePatch]:
     """A low table on the rug, its legs between the rug's vertices."""
     legs = [
         _block((x - 0.025, _PILE + _GAP, z - 0.025), (x + 0.025, 0.36 - _GAP, z + 0.025), 0.01)
@@ -188,7 +188,7 @@ def _table() -> list[Part]:
     return [_block((-0.55, 0.36, -0.45), (0.55, 0.42, 0.25), 0.015), *legs]
 
 
-def _lamp() -> list[Part]:
+def _lamp() -> list[SurfacePatch]:
     """A floor lamp: a foot with a pole, a bulb and a shade."""
     pole = [[(0.13, 0), (0.13, 0.025)], [(0.13, 0.025), (0.018, 0.035)], [(0.018, 0.035), (0.018, 1.3)]]
     bulb = [(0.02, 1.31), (0.055, 1.36), (0.045, 1.41), (0, 1.44)]
@@ -197,13 +197,13 @@ def _lamp() -> list[Part]:
     return [_turned(run, 20) for run in runs] + _band(shade, 32, 0.06)
 
 
-def _vase() -> list[Part]:
+def _vase() -> list[SurfacePatch]:
     """A hollow vase with a foot and a lip."""
     lip = [_VASE[-1], _VASE_INSIDE[0]]
     return [_turned(run, 32, step=0.025) for run in ([(0, 0), _VASE[0]], _VASE, lip, _VASE_INSIDE)]
 
 
-def _turned(control: list, sectors: int, *, step: float = 0.07) -> Part:
+def _turned(control: list, sectors: int, *, step: float = 0.07) -> SurfacePatch:
     """A smooth surface of revolution."""
     if control[0][0] == 0:
         point = np.array(control, float)
@@ -211,13 +211,13 @@ def _turned(control: list, sectors: int, *, step: float = 0.07) -> Part:
     return sweep(*curve(control, step=step, turn=0.5), sectors=sectors)
 
 
-def _band(profile: list, sectors: int, step: float) -> list[Part]:
+def _band(profile: list, sectors: int, step: float) -> list[SurfacePatch]:
     """A profile of four corners revolved about y, sharp at each corner. The corners run outward at the bottom."""
     around = itertools.pairwise([*profile, profile[0]])
     return [sweep(*curve(list(ends), step=step, turn=1.0), sectors=sectors) for ends in around]
 
 
-def _disk(radius: np.ndarray) -> Part:
+def _disk(radius: np.ndarray) -> SurfacePatch:
     """A disk that faces up. Its vertices lie on circles around one in the center, with eight more on each circle.
 
     It is a square grid whose concentric squares have become circles, so all cells have about the same size.
@@ -234,13 +234,13 @@ def _disk(radius: np.ndarray) -> Part:
     return position, grid_face(rows=2 * count + 1, columns=2 * count + 1), up
 
 
-def _between(first: np.ndarray, second: np.ndarray) -> list[Part]:
+def _between(first: np.ndarray, second: np.ndarray) -> list[SurfacePatch]:
     """Four panels from one rectangle to another."""
     edges = (itertools.pairwise([*corner, corner[0]]) for corner in (first, second))
     return [_panel([above, below]) for above, below in zip(*edges, strict=True)]
 
 
-def _panel(corner: list) -> Part:
+def _panel(corner: list) -> SurfacePatch:
     """A flat quadrilateral of the room, divided into cells. Positions do not depend on which corner comes first."""
     (a, b), (c, _) = np.array(corner, float)
     rows, columns = (max(1, round(float(np.linalg.norm(edge)) / _CELL)) for edge in (c - a, b - a))
@@ -248,7 +248,9 @@ def _panel(corner: list) -> Part:
     return np.round(position, _DIGITS), face, normal
 
 
-def _without(part: Part, axes: tuple[int, int], low: tuple[float, float], high: tuple[float, float]) -> Part:
+def _without(
+    part: SurfacePatch, axes: tuple[int, int], low: tuple[float, float], high: tuple[float, float]
+) -> SurfacePatch:
     """A part without the faces inside of a rectangle in the plane of two axes."""
     position, face, normal = part
     middle = position[face].mean(1)[:, axes]
@@ -256,7 +258,7 @@ def _without(part: Part, axes: tuple[int, int], low: tuple[float, float], high: 
     return position[used], face.reshape(-1, 3), normal[used]
 
 
-def _block(low: tuple, high: tuple, radius: float, *, step: float = _CELL) -> Part:
+def _block(low: tuple, high: tuple, radius: float, *, step: float = _CELL) -> SurfacePatch:
     """A closed box with rounded edges and smooth normals."""
     sides = _sides(np.array([low, high], float), np.full((2, 3), radius), step, list(np.ndindex(3, 2)))
     start = np.cumsum([0, *(len(position) for position, _, _ in sides)])
@@ -266,7 +268,7 @@ def _block(low: tuple, high: tuple, radius: float, *, step: float = _CELL) -> Pa
     return position, place.reshape(-1)[face], np.concatenate(normal)[first]
 
 
-def _shell(box: np.ndarray, radius: float, cell: float, sides: _Sides) -> list[Part]:
+def _shell(box: np.ndarray, radius: float, cell: float, sides: _Sides) -> list[SurfacePatch]:
     """Some sides of a box, facing inward. Edges between them are rounded, other edges straight."""
     rounding = np.zeros((2, 3))
     for axis, end in sides:
@@ -275,7 +277,7 @@ def _shell(box: np.ndarray, radius: float, cell: float, sides: _Sides) -> list[P
     return [(position, face[:, ::-1], -normal) for position, face, normal in parts]
 
 
-def _sides(box: np.ndarray, radius: np.ndarray, cell: float, sides: _Sides) -> list[Part]:
+def _sides(box: np.ndarray, radius: np.ndarray, cell: float, sides: _Sides) -> list[SurfacePatch]:
     """Some sides of a box, facing outward, with a line of vertices on both sides of the rounding at each end."""
     line = []
     for (a, b), (r, s) in zip(box.T, radius.T, strict=True):
@@ -295,7 +297,7 @@ def _sides(box: np.ndarray, radius: np.ndarray, cell: float, sides: _Sides) -> l
     return parts
 
 
-def _moved(part: Part, place: tuple[float, float, float]) -> Part:
+def _moved(part: SurfacePatch, place: tuple[float, float, float]) -> SurfacePatch:
     """A translated part."""
     position, face, normal = part
     return position + np.array(place), face, normal

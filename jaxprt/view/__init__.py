@@ -5,8 +5,7 @@ from typing import Any
 
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment
-from jaxprt.view.baked import export_baked
-from jaxprt.view.piece import Piece, export
+from jaxprt.view.piece import Piece, export, export_baked
 from jaxprt.view.server import Server
 from jaxprt.view.session import Session
 

@@ -141,7 +141,7 @@ vec4 entry(int number, int node, int which) { // a table's entries: for each lob
   return texelFetch(table, at(tableStart + (number * nodes + node) * entries + which), 0);
 }
 float factor(int l, int m) { return sqrt(float(4 * l * l - 1) / float(l * l - m * m)); }
-// The light that has come through a transfer matrix times the BRDF: see plane_table in jaxprt/view/matrices.py.
+// The light that has come through a transfer matrix times the BRDF: see plane_table in jaxprt/view/reduced.py.
 vec3 transferred(int vertex, vec3 ahead, vec3 normal, ivec2 number, float between, int node, float upper, vec3 w[4]) {
   vec3 lit[HARMONICS], tint[BANDS], result = vec3(0);
   int pairs = (bands * bands + 1) / 2;

@@ -1,30 +1,53 @@
-"""Export of a scene as a single HTML file that relights it on the browser's GPU, without Python."""
+"""Files that show a scene without Python: a page that relights it on the browser's GPU, and glTF with baked light."""
 
 import base64
 import html
 import itertools
+import json
+import math
 import os
 import pathlib
+import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxprt import require
+from jaxprt.brdf import GGX, BlinnPhong, CookTorrance
+from jaxprt.brdf.varying import Channels
 from jaxprt.files import outputs
+from jaxprt.relit.channels import Shading
 from jaxprt.relit.scene import RelitScene
-from jaxprt.scene import Environment
+from jaxprt.scene import Environment, Mesh, TexturedMaterial
+from jaxprt.scene.material import Texture
 from jaxprt.sphere import cubemap
-from jaxprt.systems import harmonic, lobe
-from jaxprt.view import matrices, messages, parts, stages
-from jaxprt.view.bases import without_layers
+from jaxprt.systems import harmonic, lobe, standard
+from jaxprt.systems.lobe import blurred_light, pyramid
+from jaxprt.view import messages, reduced, stages
 from jaxprt.view.messages import Reply
-from jaxprt.view.reduced import bits_of, coarse, light_size, resized, scale_of, systems_of
+from jaxprt.view.reduced import (
+    Exported,
+    bits_of,
+    coarse,
+    edge_of,
+    light_size,
+    resize,
+    scale_of,
+    systems_of,
+    texels_of,
+    vector_unit,
+    vectors_of,
+    visibility_of,
+    without_layers,
+)
 from jaxprt.view.server import MODULE
 from jaxprt.view.session import Session
+from jaxprt.view.stages import counterclockwise
 
 _MOST_BITS = 2**27  # largest buffer for the visibility of single texels, in bytes, that graphics cards accept
 _SKY_ROWS, _LEAST_SKY_ROWS = 1024, 128  # most rows of a picture of a light; at 128 texels are as good
@@ -48,6 +71,335 @@ const {{ content, buffers }} = unpack(await new Response(stream).arrayBuffer());
 mount(document.getElementById("viewer"), answers(content, buffers));
 </script></body></html>
 """
+NO_SCALES = {"edges": [1], "spreads": [1.0], "starts": [0]}  # for scenes without glossy parts
+_STARTS = ("first", "weightStart", "pyramidStart", "visibleStart", "arrivedStart", "bitStart")
+# Terms by which the page's module represents `ShininessFamily` and `SlopeFamily`.
+_TERMS = {standard.BLINN_PHONG: [3, 4], standard.COOK_TORRANCE: [3, 5, 6]}
+_SKY = 64  # most texels along the edge of a light's faces
+_MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
+_FLOAT, _UINT = 5126, 5125
+_ARRAY, _ELEMENT = 34962, 34963
+
+
+def scene_content(reduced: RelitScene, level: int) -> tuple[dict[str, Any], list[bytes]]:
+    """JSON description and arrays of all parts. `Piece` in the page's module defines their order."""
+    systems, bits = systems_of(reduced), bits_of(reduced)
+    vectors, visible = [vectors_of(exported) for exported in systems], visibility_of(reduced)
+    unit, visible_unit = vector_unit(vectors), vector_unit(visible)
+    terms = max(-(-len(unit) // 4) * 4, 4)
+    place: dict[str, int] = dict.fromkeys(_STARTS, 0)
+    tables, tilted = _Tables(), reduced.table.at_vertices().normal
+    parts, stride = [], 0
+    arrays: list[list[np.ndarray]] = [[] for _ in range(6)]
+    for number, (part, system, vector) in enumerate(zip(reduced.scene.parts, systems, vectors, strict=True)):
+        shading, (start, table) = reduced.shading[number], tables.add(part.name, system)
+        weight, seen, described = (
+            _weights(shading, system),
+            _means(system, level),
+            _material_json(part.material, shading),
+        )
+        words = None if bits is None else bits[number]
+        bit = np.zeros((0, 0), np.uint8) if words is None else words
+        about = _system_json(system) | {"family": _family(shading), "texels": bool(bit.size)}
+        about |= {"name": part.name, "count": vector.shape[1], "channels": weight.shape[1] - 1}
+        about |= {"nodes": table.shape[1], "entries": table.shape[2], "terms": -(-len(vector) // 4) * 4}
+        about |= {"weightStep": 0 if described else weight.shape[1], **(described or {})}
+        parts.append(about | place | {"tableStart": start})
+        weight = weight[:1] if described else weight
+        stride = max(stride, seen.shape[1])
+        rows = _bytes(vector, unit, terms), _bytes(visible[number], visible_unit, 4 * about["words"])
+        first = int(reduced.place.first[number])
+        direction = shading.mesh.normal if tilted is None else tilted[first : first + len(shading.mesh.normal)]
+        normal = np.round(32767 * np.asarray(direction))
+        kinds = "<i2", "i1", "u1", "<f4", "i1", "u1"
+        for column, array, kind in zip(arrays, (normal, rows[0], seen, weight, rows[1], bit), kinds, strict=True):
+            column.append(array.astype(kind).reshape(-1))
+        pairs = len(vector.T) * -(-(about["bands"] ** 2) // 2)
+        sizes = vector.shape[1], weight.size // 4, seen.size, rows[1].size // 4, pairs, bit.size
+        place = {name: start + size for (name, start), size in zip(place.items(), sizes, strict=True)}
+    content = {"parts": parts, "terms": terms, "vectorUnit": unit.tolist(), "stride": stride, **_scales(reduced, level)}
+    content |= {"visibleUnit": visible_unit.tolist(), "arrived": place["arrivedStart"]}
+    edge = 0 if bits is None else math.isqrt(8 * next(words.shape[1] for words in bits if words is not None) // 6)
+    content |= {"texelEdge": edge, "texels": texels_of(edge) if edge else 0}
+    joined = [np.concatenate(column) for column in arrays]
+    joined.insert(3, tables.joined())
+    joined[2] = np.append(joined[2], np.zeros(4 - len(joined[2]) % 4, np.uint8))  # whole words
+    return content, [array.tobytes() for array in joined]
+
+
+class _Tables:
+    """The tables of a page. Parts with one BRDF share one table."""
+
+    def __init__(self):
+        """Starts without tables."""
+        self._made: dict[Any, tuple[int, Float[np.ndarray, "h q e 4"]]] = {}
+        self._end = 0
+
+    def add(self, name: str, system: Exported) -> tuple[int, Float[np.ndarray, "h q e 4"]]:
+        """The table of a part's system, and where its texels start among those of all tables."""
+        key = _key(system)
+        if key not in self._made:
+            table = _table(name, system)
+            self._made[key] = self._end, table
+            self._end += table.size // 4
+        return self._made[key]
+
+    def joined(self) -> Float[np.ndarray, " n"]:
+        """The texels of all tables."""
+        return np.concatenate([table.astype("<f4").reshape(-1) for _, table in self._made.values()])
+
+
+def _key(system: Exported) -> Any:
+    """Equal for systems with equal tables."""
+    if isinstance(system, harmonic.DiffuseSystem):
+        return None
+    leaves, kind = jax.tree.flatten(system.brdf)
+    return kind, *((np.shape(leaf), np.asarray(leaf).tobytes()) for leaf in leaves)
+
+
+def _system_json(system: Exported) -> dict[str, Any]:
+    """JSON description of a part's system for the page's module."""
+    about = {"lobes": 0, "bands": 0, "words": 0, "steps": 0.0, "knot": [], "laplacian": 1.0}
+    if isinstance(system, lobe.LobeSystem):
+        return about | {"lobes": system.brdf.lobes, "steps": float(system.brdf.weight.shape[-1] - 1), **_knot(system)}
+    if isinstance(system, harmonic.HarmonicSystem):
+        fields = {
+            "bands": system.degree + 1,
+            "words": reduced.matrix_words(system),
+            "laplacian": float(system.laplacian),
+        }
+        return about | fields | {"steps": system.brdf.steps, **_knot(system)}
+    return about
+
+
+def _knot(system: lobe.LobeSystem | harmonic.HarmonicSystem) -> dict[str, list[float]]:
+    return {"knot": np.asarray(system.brdf.knot[0], float).tolist() if system.brdf.knot else []}
+
+
+def _bytes(value: Float[np.ndarray, "k v"], unit: Float[np.ndarray, " m"], length: int) -> Float[np.ndarray, "v l"]:
+    """Values quantized to integer multiples of the units, in rows of a given length."""
+    padded = np.zeros((value.shape[1], length))
+    padded[:, : len(value)] = np.round(value / unit[: len(value), None]).T
+    return padded
+
+
+def _scales(reduced: RelitScene, level: int) -> dict[str, Any]:
+    """The scales of visibility that the page keeps."""
+    scale = scale_of(reduced)
+    if scale is None:
+        return NO_SCALES
+    starts = scale.start[level:] - scale.start[level]
+    return {"edges": scale.edge[level:].tolist(), "spreads": scale.spread[level:].tolist(), "starts": starts.tolist()}
+
+
+def mip_edges(size: int) -> list[int]:
+    """Sizes of the cubemaps in the mip chain that the page computes from a light."""
+    while size > _SKY and size % 2 == 0:
+        size //= 2
+    result = [size]
+    while result[-1] % 2 == 0 and result[-1] > 4:
+        result.append(result[-1] // 2)
+    return result
+
+
+def blur_parameters(size: int) -> dict[str, Any]:
+    """Parameters for blurring the light to all lobe widths, as `jaxprt.systems.lobe.blurred_light.prefilter` does."""
+    scale = blurred_light.scales(size)
+    pairs = zip(scale.edge.tolist(), scale.spread.tolist(), strict=True)
+    source, variances, concentration = zip(*(blurred_light.blur(*pair, size=size) for pair in pairs), strict=True)
+    return {
+        "edges": scale.edge.tolist(),
+        "spreads": scale.spread.tolist(),
+        "starts": scale.start.tolist(),
+        "total": scale.total,
+        "sources": source,
+        "concentrations": concentration,
+        "reaches": [min(np.pi, blurred_light.REACH * np.sqrt(variance)) for variance in variances],
+    }
+
+
+def _family(shading: Shading) -> dict[str, list]:
+    """Numbers of the BRDF terms of a part's channels in the page's module, and their factors; empty if unknown."""
+    if shading.blend is None or shading.scale is None:
+        return {"terms": [], "scale": []}
+    terms = list(shading.term) if shading.table is None else _TERMS.get(shading.table, list(shading.term))
+    return {"terms": terms, "scale": np.asarray(shading.scale, float).tolist()}
+
+
+def _means(system: Exported, level: int) -> np.ndarray:
+    if not isinstance(system, lobe.LobeSystem):
+        return np.zeros((0, 0), np.uint8)
+    transport = system.transport
+    return np.ascontiguousarray(np.asarray(transport.pyramid)[:, pyramid.scales(edge_of(transport)).start[level] :])
+
+
+def _table(name: str, system: Exported) -> Float[np.ndarray, "h q e 4"]:
+    """Table of a part's BRDF. Parts with transfer matrices use `jaxprt.view.reduced.plane_table`.
+
+    For lobes it holds, for each knot and view node, the mean, log concentration and weights of each lobe, and albedos.
+    """
+    if isinstance(system, harmonic.HarmonicSystem):
+        return reduced.plane_table(name, system.brdf)
+    if not isinstance(system, lobe.LobeSystem):
+        return np.ones((1, 1, 1, 4))
+    brdf = system.brdf
+    mean, scale, weight, albedo = (np.asarray(array) for array in (brdf.mean, brdf.scale, brdf.weight, brdf.diffuse))
+    if not brdf.knot:
+        mean, scale, weight, albedo = mean[:, :, None], scale[:, None], weight[:, :, None], albedo[:, None]
+    lobes, knots, nodes = scale.shape
+    result = np.zeros((knots, nodes, 2 * lobes + 1, 4))
+    result[:, :, 0:-1:2, :3] = mean.transpose(2, 3, 1, 0)
+    result[:, :, 0:-1:2, 3] = scale.transpose(1, 2, 0)
+    result[:, :, 1::2, : len(weight)] = weight.transpose(2, 3, 1, 0)
+    result[:, :, -1, : len(albedo)] = albedo.transpose(1, 2, 0)
+    return result
+
+
+def _weights(shading: Shading, system: Exported) -> Float[np.ndarray, "v k 4"]:
+    """Channel weights at each vertex, followed by its emission. The first row also holds the logarithm of roughness."""
+    count = len(shading.mesh.position)
+    if shading.blend is not None:
+        weight = np.asarray(shading.blend.weight)
+    elif isinstance(system, harmonic.DiffuseSystem):
+        weight = np.broadcast_to(np.asarray(system.albedo), (count, 1, len(system.albedo)))
+    else:
+        brdf = system.brdf
+        channels = len(brdf.weight) if isinstance(brdf, lobe.LobeBrdf) else brdf.table.shape[1]
+        weight = np.broadcast_to(np.eye(channels) if channels > 1 else np.ones((1, 3)), (count, channels, 3))
+    result = np.zeros((count, weight.shape[1] + 1, 4))
+    result[:, :-1, :3] = weight
+    if shading.blend is not None and shading.blend.parameter:
+        result[:, 0, 3] = np.asarray(shading.blend.parameter[0])
+    elif isinstance(shading.brdf, Channels):  # isotropic GGX with a constant roughness
+        result[:, 0, 3] = np.log(
+            next(float(model.roughness[0]) for model in shading.brdf.model if isinstance(model, GGX))
+        )
+    if shading.emitted is not None:
+        result[:, -1, :3] = np.asarray(shading.emitted)
+    return result
+
+
+def _colors(material: Any, *names: str) -> dict[str, list[float]]:
+    """Parameters of a material in three colors."""
+    return {name: np.broadcast_to(np.asarray(getattr(material, name), float), 3).tolist() for name in names}
+
+
+def _material_json(material: Any, shading: Shading) -> dict[str, Any] | None:
+    """Parameters of a material that is the same at all vertices; None for other materials."""
+    if isinstance(material, BlinnPhong) and shading.table == standard.BLINN_PHONG:
+        return {"material": _colors(material, "diffuse", "specular") | {"exponent": float(material.exponent)}}
+    if isinstance(material, CookTorrance) and shading.table == standard.COOK_TORRANCE:
+        return {"material": _colors(material, "diffuse", "specular", "f0") | {"slope": float(material.roughness)}}
+    if not isinstance(material, TexturedMaterial) or shading.scale is None:
+        return None
+    if any(isinstance(leaf, Texture) for leaf in jax.tree.leaves(material, is_leaf=lambda x: isinstance(x, Texture))):
+        return None
+    names = ("base_color", "metallic", "specular", "specular_color", "ior", "roughness")
+    values = {name: np.asarray(getattr(material, name), float).tolist() for name in names}
+    return {"material": values}
+
+
+def export_baked(
+    scene: RelitScene,
+    path: str | os.PathLike,
+    environment: Environment,
+    *,
+    eye: Float[Array | np.ndarray, "3"] | None = None,
+    materials: Mapping[str, Any] | None = None,
+) -> float:
+    """Writes a scene as binary glTF with baked lighting: radiance under one light towards one eye position.
+
+    Each part becomes a mesh with radiance in COLOR_0 and an unlit material (KHR_materials_unlit). From other eye
+    positions the file shows the same radiance. Colors in glTF are linear and at most 1, so all are divided by the
+    largest radiance, which is stored as `exposure` in `extras`. Negative radiance becomes 0. Names in the file state
+    that it is baked.
+
+    Args:
+        scene: The result of `jaxprt.precompute`.
+        path: The file, `*.glb`.
+        environment: The light.
+        eye: Position of the viewer in world units; that of the scene's camera if None.
+        materials: Dictionary from names of parts to materials that replace their own.
+
+    Returns:
+        The factor by which the colors in the file must be multiplied to give radiance.
+
+    Raises:
+        TypeError: `scene` is not a relit scene, or `environment` is not an `Environment`.
+        ValueError: The suffix of the file is not .glb, or `RelitScene.radiance` refuses the light, eye or materials.
+        OSError: The file cannot be written, found before the radiance is computed where possible.
+
+    Reference: Khronos, glTF 2.0 specification, sections 3.7.2 and 4.4; KHR_materials_unlit.
+    """
+    require.kind("the scene", scene, RelitScene, source="jaxprt.precompute")
+    require.kind("the light", environment, Environment, source="jaxprt.load_environment")
+    path = outputs.target(path, ".glb")
+    eye = scene.camera.eye if eye is None else eye
+    color = np.asarray(scene.radiance(environment, eye=eye, materials=materials), np.float32)
+    if color.ndim != 2:
+        raise ValueError(f"the light must be one environment, got a batch of {len(color)}")
+    color = np.maximum(np.broadcast_to(color, (len(color), 3)), 0)
+    exposure = max(float(color.max(initial=0)), 1e-30)
+    outputs.write(path, _file(scene, color / np.float32(exposure), np.asarray(eye, float).tolist(), exposure))
+    return exposure
+
+
+def _file(scene: RelitScene, color: Float[np.ndarray, "v 3"], eye: list[float], exposure: float) -> bytes:
+    views, accessors, meshes, nodes, data = [], [], [], [], b""
+
+    def add(array: np.ndarray, kind: str, component: int, target: int, **more: Any) -> int:
+        nonlocal data
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes, "target": target})
+        accessors.append(
+            {"bufferView": len(views) - 1, "componentType": component, "count": len(array), "type": kind, **more}
+        )
+        data += array.tobytes()
+        return len(accessors) - 1
+
+    first = 0
+    for part in scene.scene.parts:
+        mesh: Mesh = part.mesh
+        part_color = color[first : first + len(mesh.position)]
+        first += len(part_color)
+        position = np.asarray(mesh.position, "<f4")
+        span = {"min": position.min(0).tolist(), "max": position.max(0).tolist()}
+        primitive = {
+            "attributes": {
+                "POSITION": add(position, "VEC3", _FLOAT, _ARRAY, **span),
+                "COLOR_0": add(np.clip(part_color, 0, 1).astype("<f4"), "VEC3", _FLOAT, _ARRAY),
+            },
+            "indices": add(counterclockwise(mesh).reshape(-1), "SCALAR", _UINT, _ELEMENT),
+            "material": 0,
+        }
+        name = f"{part.name}, baked for one light and one view"
+        meshes.append({"name": name, "primitives": [primitive]})
+        place = {"translation": list(mesh.origin)} if any(mesh.origin) else {}
+        nodes.append({"name": name, "mesh": len(meshes) - 1, **place})
+    unlit = {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    head = {
+        "asset": {"version": "2.0", "generator": "jaxprt", "extras": {"baked": True, "eye": eye, "exposure": exposure}},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"name": "baked for one light and one view", "nodes": list(range(len(nodes)))}],
+        "nodes": nodes,
+        "meshes": meshes,
+        "materials": [{"name": "baked", "pbrMetallicRoughness": unlit, "extensions": {"KHR_materials_unlit": {}}}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(data)}],
+    }
+    text = json.dumps(head, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    size = 12 + 8 + len(text) + 8 + len(data)
+    return b"".join(
+        [
+            struct.pack("<III", _MAGIC, 2, size),
+            struct.pack("<II", len(text), _JSON),
+            text,
+            struct.pack("<II", len(data), _BIN),
+            data,
+        ]
+    )
 
 
 class Piece(NamedTuple):
@@ -117,7 +469,7 @@ def export(
     least = 0
     for texels, size in itertools.product([True, False] if fits else [False], _sizes(bare)):
         reduced = coarse(bare, size.level, texels=texels, degree=size.degree)
-        contents = parts.content(reduced, size.level)
+        contents = scene_content(reduced, size.level)
         least = len(_page(session, reduced, lights, contents, error=0.0, title=path.stem))
         if least > most + _SPARE:
             continue
@@ -155,7 +507,7 @@ def _sizes(scene: RelitScene) -> list[_Size]:
     while True:
         result.append(_Size(level, 0 if scale is None else int(scale.edge[level]), degree))
         means = 0 if scale is None or level == len(scale.edge) - 1 else lobes * int(scale.total - scale.start[level])
-        bands = 0 if degree is None or degree <= 1 else sum(matrices.nbytes(system, degree) for system in matrix)
+        bands = 0 if degree is None or degree <= 1 else sum(reduced.matrix_bytes(system, degree) for system in matrix)
         if not means and not bands:
             return result
         if means >= bands:
@@ -191,9 +543,9 @@ def _page(
     """The content of the HTML file."""
     reply = session.answer({"kind": "scene"})
     content, arrays = contents
-    mips = parts.mips(next(iter(lights.values())).radiance.shape[-2])
+    mips = mip_edges(next(iter(lights.values())).radiance.shape[-2])
     size = light_size(reduced)
-    blurring = parts.blur_parameters(size) if size else parts.NO_SCALES
+    blurring = blur_parameters(size) if size else NO_SCALES
     free = [
         part | {"free": _free_parameters(part["free"]) if "material" in entry else None}
         for part, entry in zip(reply.content["parts"], content["parts"], strict=True)
@@ -256,5 +608,5 @@ def _free_parameters(free: dict[str, Any]) -> dict[str, Any]:
 
 
 def _light_texels(light: Environment, size: int) -> Float[np.ndarray, "6 n n 3"]:
-    radiance = np.asarray(resized(light, size=size).radiance)
+    radiance = np.asarray(resize(light, size=size).radiance)
     return np.broadcast_to(radiance, (*radiance.shape[:-1], 3))

@@ -15,7 +15,7 @@ from jaxprt.scene.mesh import make_mesh
 from jaxprt.sphere import cubemap
 from jaxprt.systems import bounces, standard
 from jaxprt.systems.protocol import Blend
-from jaxprt.view.bases import without_layers
+from jaxprt.view.reduced import without_layers
 
 # Of the table of albedos of sheens: above three degrees over the horizon, and below, where views of the last step are.
 ALBEDO, ALBEDO_AT_HORIZON = 0.004, 0.009

@@ -5,8 +5,8 @@ import pytest
 import jaxprt as prt
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.scene import Part, Scene, TexturedMaterial
+from jaxprt.scene.builtin import assemble, patch
 from jaxprt.scene.mesh import make_mesh
-from jaxprt.scene.shapes import assemble, patch
 
 
 def square(low, high, height):

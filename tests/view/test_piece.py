@@ -15,7 +15,8 @@ from jaxprt.relit.groups import Place
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
-from jaxprt.view import messages, parts, stages
+from jaxprt.view import messages, stages
+from jaxprt.view.piece import scene_content
 from jaxprt.view.reduced import coarse
 
 SHOWN = 'mount(document.getElementById("viewer"), answers(content, buffers));'
@@ -252,7 +253,7 @@ def test_parts_with_one_kind_of_material_share_a_table(recipe):
     pairs = zip(meshes, materials.items(), strict=True)
     scene = Scene([Part(name, mesh, material) for mesh, (name, material) in pairs])
     made = prt.precompute(scene, refine=False, system=recipe, size=8, progress=False)
-    content, arrays = parts.content(coarse(made, 2, texels=False), 2)
+    content, arrays = scene_content(coarse(made, 2, texels=False), 2)
     first, shiny, second, matte = content["parts"]
     assert first["tableStart"] == second["tableStart"] == 0
     sizes = [part["entries"] * part["nodes"] * max(len(part["knot"]), 1) for part in (first, shiny, matte)]

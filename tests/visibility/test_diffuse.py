@@ -7,8 +7,8 @@ import trimesh
 
 from jaxprt import brdf, reference
 from jaxprt.scene import Environment, builtin, light_samples, subdivision
+from jaxprt.scene.builtin import assemble, patch
 from jaxprt.scene.mesh import join, make_mesh
-from jaxprt.scene.shapes import assemble, patch
 from jaxprt.scene.subdivision import Edges
 from jaxprt.visibility.diffuse import DiffuseTracer
 

@@ -6,8 +6,8 @@ import pytest
 import trimesh
 
 from jaxprt.scene import Environment
+from jaxprt.scene.builtin import assemble, patch
 from jaxprt.scene.mesh import join, make_mesh
-from jaxprt.scene.shapes import assemble, patch
 from jaxprt.visibility import refine
 
 SIZE, ROW, COLUMN = 4, 1, 2  # the texel of the sun on the upper face: s in [0, 1/2], t in [-1/2, 0]
