@@ -33,6 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import harness, path_tracing, relight_dynamic
+from benchmarks.published.transfer import truncate
 from benchmarks.relight_dynamic import Triple
 from jaxprt import bounces, dynamic, files, image
 from jaxprt.brdf import CookTorrance, navigation
@@ -124,7 +125,7 @@ def measure_scene(published: Published, members, along, plane, quick: bool, stor
     options |= {"path": path and path / "bounces", "progress": False}
     full = bounces.precompute(mesh, [along] * 2, **options)
     seconds = time.perf_counter() - start
-    tensor = full.truncate(4, modes=4) if quick else full.truncate(DEFAULT[0], modes=DEFAULT[1])
+    tensor = truncate(full, 4, modes=4) if quick else truncate(full, DEFAULT[0], modes=DEFAULT[1])
     triples = relight_dynamic.draw(glossy, size, quick)[: 2 if quick else 10]
     materials = [relight_dynamic.materials(plane, each, 2) for each in triples]
     scene = Scene(mesh, transport, tensor, [members] * 2, triples, materials)
@@ -286,7 +287,7 @@ def figure_9(scene: Scene, full: bounces.TransferTensor, common: dict, quick: bo
     exact = [reflected(scene, full, number)[0] for number in numbers]
     for components, modes in [(2, 4)] if quick else CUTS:
         start = time.perf_counter()
-        short = full.truncate(components, modes=modes)
+        short = truncate(full, components, modes=modes)
         seconds = time.perf_counter() - start
         found = [reflected(scene, short, number)[0] for number in numbers]
         change = [np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in zip(found, exact, strict=True)]
@@ -301,7 +302,7 @@ def figure_10(scene: Scene, full: bounces.TransferTensor, pictures: pathlib.Path
     """Reflected light by shorter decompositions, and by the longest one last."""
     camera = camera_of(scene, scene.triples[PICTURED])
     tiles = []
-    for tensor in (*(full.truncate(components, modes=modes) for components, modes in CUTS), full):
+    for tensor in (*(truncate(full, components, modes=modes) for components, modes in CUTS), full):
         color = jnp.asarray(sum(reflected(scene, tensor, PICTURED)))
         tiles.append(np.asarray(image.render(scene.mesh, color, camera, background=None)))
     rows = [np.concatenate(tiles[at : at + 4], 1) for at in (0, 4)]

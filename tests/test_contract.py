@@ -42,6 +42,7 @@ from jaxprt.decompose import mixture as mixture_system
 from jaxprt.image import Pixels, raster
 from jaxprt.scene.environment import Sun
 from jaxprt.scene.points import Points
+from jaxprt.systems.lamps import LampTransport
 
 GRADIENT_TOLERANCE = 1e-5  # Central differences in float64, of the norm of the gradient.
 STEP = 1e-6
@@ -89,6 +90,7 @@ HOST = {
     "benchmarks.published.factorization": "checks values",
     "benchmarks.published.lobes.mirror_lobes": "checks values",
     "benchmarks.published.tensors.factor_tensor": "checks values",
+    "benchmarks.published.transfer": "takes half precision; tests/figures/test_transfer.py",
     "benchmarks.published.tensors.hooi": "gives vectors of either sign",
     "systems.axes": "reads annotations",
     "systems.ranges": "cuts objects",
@@ -188,6 +190,7 @@ HOST = {
     "systems.bounces.gather.shares": "NumPy on the host",
     "systems.bounces.gather.cosines": "NumPy on the host",
     "systems.bounces.gather.measures": "NumPy on the host",
+    "systems.bounces.patches.exchange": "traces rays",
     "systems.bounces.patches.divide": "sorts on the host, where data enters",
     "systems.bounces.tensor.twice": "a count",
     "systems.bounces.jobs": "traces rays, and gives half precision and vectors of either sign",
@@ -391,6 +394,11 @@ class Draw:
         lobe, maps = self.lobes(), (self.normal(2, 4, 4), self.normal(3, 4, 4))
         factor = self.normal(len(lobe.weight), 2)
         return dynamic.DynamicBrdf(lobe, self.normal(2, 2, 3), factor, *maps, self.uniform())
+
+    def lamps(self, vertices=2):
+        """Transport of two lamps, the first of two pieces."""
+        moment = self.uniform(3, vertices), self.uniform(3, vertices), self.normal(3, 3, vertices)
+        return LampTransport(*moment, self.normal(vertices, 3), self.rotation(vertices), (0, 0, 1))
 
     def regions(self, size=8, vertices=3):
         """Transport of one region for ``changing`` and ``light``."""
@@ -785,6 +793,9 @@ EXAMPLES = {
     # Frames have derivatives along rotations only; see sphere.rotation.
     "systems.bounces.gather.respond": example(
         lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable()), gradient=("basis",), edge=2
+    ),
+    "systems.bounces.gather.respond_to_lamps": example(
+        lambda draw: call(draw.lamps(), draw.rotation(2), draw.separable()), gradient=("basis",)
     ),
     "systems.bounces.gather.respond_again": example(
         lambda draw: call(draw.normal(4, 3, 2), draw.rotation(2), draw.separable()),

@@ -197,7 +197,7 @@ def exact_vertices(view: View, vertices: list[np.ndarray]) -> list[np.ndarray]:
     options = {"eye": view.camera.eye, "occluder": view.scene.mesh, "progress": True}
     result, shadings = [], [of_part(part) for part in view.scene.parts]
     lamps = Lamps.of(centered(view.scene), shadings)
-    eye = view.camera.local(view.scene.mesh.origin).eye
+    eye = jnp.asarray(view.camera.local(view.scene.mesh.origin).eye)
     for shading, vertex in zip(shadings, vertices, strict=False):
         color = np.asarray(reference.radiance(shading.mesh, shading.exact, lights, vertex=vertex, **options))
         color = color + lamps.at_vertices(shading.mesh, measuring.exact_brdf(shading, vertex), vertex, eye)

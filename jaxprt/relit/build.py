@@ -137,7 +137,7 @@ def precompute(
     if bounces:
         # One store serves any number of bounces: a larger number resumes from a smaller one.
         target = Target(mesh, path=folder and folder / "scene", **options)
-        reflected = reflection.make(shadings, place, bounces, target, lit and lit.transport(place))
+        reflected = reflection.make(shadings, place, bounces, target, lamp=lit and lit.transport(place))
         lobes = reflection.lobes(shadings, place, systems) if rays else None
     given = {"lamps": lit, "lobes": lobes, "rays": rays, "division": divided, "copied": copied}
     return RelitScene(scene, shadings, place, systems, reflected, **given)

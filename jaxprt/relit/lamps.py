@@ -56,8 +56,9 @@ class SceneLamps(eqx.Module):
             rows = [np.take(np.asarray(getattr(own, name)), np.arange(len(vertex)), axis) for vertex, own in groups]
             return np.take(np.concatenate(rows, axis), order, axis)
 
-        moments = [column(name, -1) for name in ("solid_angle", "cosine", "direction")]
-        return LampTransport(*jax.device_put((*moments, column("position", 0), column("frame", 0))), groups[0][1].lamp)
+        solid, cosine, direction = (column(name, -1) for name in ("solid_angle", "cosine", "direction"))
+        arrays = jax.device_put((solid, cosine, direction, column("position", 0), column("frame", 0)))
+        return LampTransport(*arrays, lamp=groups[0][1].lamp)
 
     def radiance(self, appearances: Sequence[Appearance], changed: Mapping[str, PointLight]) -> Float[Array, "n 3"]:
         """Radiance of each lamp: the mean over the area of an emitting part, or the intensity of a point light.

@@ -49,7 +49,7 @@ def check(count: int | str | None) -> None:
 
 
 def make(
-    shadings: Sequence[Shading], place: Place, count: int | str, target: Target, lamp: LampTransport | None = None
+    shadings: Sequence[Shading], place: Place, count: int | str, target: Target, *, lamp: LampTransport | None = None
 ) -> GroupBounces:
     """Precomputes the light of the environment and of lamps that all parts reflect onto each other and themselves.
 

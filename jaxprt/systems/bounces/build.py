@@ -315,7 +315,7 @@ def _to_lamps(lamps: LampTransport, basis: SeparableBrdf, vertex: np.ndarray) ->
     row = np.resize(vertex, shared_size(len(vertex)))  # repeated to a size that scenes share
     moment = [np.asarray(column)[..., row] for column in (lamps.solid_angle, lamps.cosine, lamps.direction)]
     place = np.asarray(lamps.position)[row], np.asarray(lamps.frame)[row]
-    few = LampTransport(*jax.device_put((*moment, *place)), lamps.lamp)
+    few = LampTransport(*jax.device_put((*moment, *place)), lamp=lamps.lamp)
     return np.asarray(gather.respond_to_lamps(few, few.frame, basis))[: len(vertex)]
 
 
@@ -336,7 +336,7 @@ def _second(
     if job.lamps:
         weight = np.concatenate([weight, found["lamp_weight"].reshape(*member.shape, -1)], -1)
         lamp = jax.device_put(found["lamp"])
-    return SecondBounce(*map(jax.device_put, (weight, found["core"], found["error"])), lamp), found["white"]
+    return SecondBounce(*map(jax.device_put, (weight, found["core"], found["error"])), lamp=lamp), found["white"]
 
 
 def _white(factor: Array, channel: Array | None) -> np.ndarray:

@@ -232,7 +232,7 @@ def collect(
     met, row, matte = jnp.sum(light.first * weight.T[:, None, None], -1), tensor.weight, light.matte
     if lamp is not None and tensor.lamp is not None:
         met = _beside(met, jnp.einsum("ginsq,iqc->gcns", tensor.lamp.astype(met.dtype), lamp[:, None] * weight))
-        if matte is not None:
+        if matte is not None and tensor.patches is not None and tensor.patches.lamp is not None:
             matte = matte + tensor.patches.lamp @ lamp
     once, twice = met, None
     if light.second is not None and tensor.second is not None:

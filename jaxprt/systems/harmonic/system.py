@@ -177,14 +177,13 @@ class DiffuseSystem(protocol.VertexSystem):
 
 def _coefficients(light: Any, degree: int) -> Float[Array, "lm c *w"]:
     """SH coefficients of one light, which may be given as such."""
-    if isinstance(light, Environment) or jnp.ndim(light) not in (2, 3):
+    if getattr(light, "ndim", 0) not in (2, 3):
         return project(protocol.one_light(light), degree=degree)
-    light = _light(light)
-    if harmonics.degree_of(light.shape[0]) != degree:
-        raise ValueError(
-            f"the light must have the transport's degree {degree}, got {harmonics.degree_of(light.shape[0])}"
-        )
-    return light
+    rows = int(light.shape[0])
+    if rows != (degree + 1) ** 2:
+        got = math.isqrt(rows) - 1 if rows and math.isqrt(rows) ** 2 == rows else f"{rows} coefficients"
+        raise ValueError(f"the light must have the transport's degree {degree}, got {got}")
+    return _light(light)
 
 
 @require.arguments(light=partial(protocol.one_light, batch=True), degree=_degree)
