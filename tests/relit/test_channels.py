@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.brdf import CookTorrance, Lambert, MetallicRoughness
+from jaxprt.brdf import AshikhminShirley, Lambert, MetallicRoughness
 from jaxprt.brdf.varying import Channels, PerVertex
 from jaxprt.relit import channels
 from jaxprt.relit.channels import Appearance, RoughnessFamily, appearance, of_part
@@ -235,7 +235,7 @@ def test_a_texture_of_anisotropy_counts_as_its_mean_and_says_so():
 
 
 def test_a_plain_brdf_stays_as_it_is():
-    model = CookTorrance()
+    model = AshikhminShirley()
     shading = of_part(patch(model))
     assert shading.brdf is shading.exact is model
     assert shading.blend is None
