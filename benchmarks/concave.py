@@ -130,7 +130,8 @@ def measure(
     place = Place.of(sizes, [[number] for number in range(len(sizes))], [False] * len(sizes))  # a group for each part
     for count in counts:
         start = time.perf_counter()
-        system = reflection.make(scene.shadings, place, count, Target(scene.mesh, size=16, progress=False))
+        target = Target(scene.mesh, size=16, progress=False)
+        system = reflection.make(scene.shadings, place, count, target, changing=[True] * len(sizes))
         seconds = time.perf_counter() - start
         blends = [each.blend for each in scene.shadings]
         frame = harness.measure(lambda: _radiance(system, scene, blends), repeats=2 if quick else 10)  # noqa: B023

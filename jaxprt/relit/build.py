@@ -137,7 +137,9 @@ def precompute(
     if bounces:
         # One store serves any number of bounces: a larger number resumes from a smaller one.
         target = Target(mesh, path=folder and folder / "scene", **options)
-        reflected = reflection.make(shadings, place, bounces, target, lamp=lit and lit.transport(place))
+        changing = [recipes[members[0]].changing for members in place.parts]
+        given = {"changing": changing, "lamp": lit and lit.transport(place)}
+        reflected = reflection.make(shadings, place, bounces, target, **given)
         lobes = reflection.lobes(shadings, place, systems) if rays else None
     given = {"lamps": lit, "lobes": lobes, "rays": rays, "division": divided, "copied": copied}
     return RelitScene(scene, shadings, place, systems, reflected, **given)

@@ -97,7 +97,7 @@ def of_group(shadings: Sequence[Shading]) -> Path:
     same albedo. That is a tenth of the work, and changes little of what arrives in low-order harmonics.
     """
     path = factored(shadings[0])
-    if path.sent is None or not all(_is_diffuse(shading, path) for shading in shadings):
+    if path.sent is None or not all(sends_diffusely(shading, path) for shading in shadings):
         return path
     albedo = path.sent.factor @ bounces.functions.albedo(path.brdf)
     flat = jnp.ones((1, 4, 4, 1), albedo.dtype)
@@ -105,8 +105,13 @@ def of_group(shadings: Sequence[Shading]) -> Path:
     return Path(lambert, Sent(path.sent.knot, albedo[..., None]))
 
 
-def _is_diffuse(shading: Shading, path: Path) -> bool:
-    """Whether a part sends little light by lobes, and none by narrow ones."""
+def sends_diffusely(shading: Shading, path: Path) -> bool:
+    """Whether a part sends little light by lobes, and none by narrow ones.
+
+    Args:
+        shading: The `Shading` of the part.
+        path: The result of `factored` for it.
+    """
     if shading.layered or shading.blend is None or shading.smoothest < np.log(_WIDE):
         return False
     weight = np.asarray(typical(shading, path), np.float64)
