@@ -119,8 +119,7 @@ def precompute(
     recipes = [_recipe(system, part.name, scene) for part in scene.parts]
     near = centered(scene)
     shadings = shaded(near.parts, recipes)
-    pairs = zip(scene.parts, shadings, strict=True)
-    scene = dataclasses.replace(scene, parts=[channels.as_shaded(part, shading) for part, shading in pairs])
+    scene = dataclasses.replace(scene, parts=list(map(channels.as_shaded, scene.parts, shadings)))
     mesh, whole = near.mesh, scene.mesh
     warn.of_gain(near, shadings)
     warn.of_shells(near)
@@ -133,13 +132,13 @@ def precompute(
     targets = [Target(mesh, path=folder and folder / name, **options) for name in names]
     systems = _systems(recipes, shadings, targets, place)
     lit = lamps.make(near, shadings, place, systems, targets, scene.point_lights)
-    reflected, lobes = None, None
+    reflected = lobes = None
     if bounces:
         # One store serves any number of bounces: a larger number resumes from a smaller one.
         target = Target(mesh, path=folder and folder / "scene", **options)
         changing = [recipes[members[0]].changing for members in place.parts]
-        given = {"changing": changing, "lamp": lit and lit.transport(place)}
-        reflected = reflection.make(shadings, place, bounces, target, **given)
+        lamp = lit and lit.transport(place)
+        reflected = reflection.make(shadings, place, bounces, target, changing=changing, lamp=lamp)
         lobes = reflection.lobes(shadings, place, systems) if rays else None
     given = {"lamps": lit, "lobes": lobes, "rays": rays, "division": divided, "copied": copied}
     return RelitScene(scene, shadings, place, systems, reflected, **given)

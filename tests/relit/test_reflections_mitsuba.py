@@ -89,9 +89,7 @@ def test_reflected_light_is_that_of_mitsuba(relit, roughness):
     with np.load(KEPT) as file:
         exact = file[str(roughness)].astype(np.float32)
     direct = relit.without_bounces()
-    with (
-        contextlib.nullcontext() if metallic else pytest.warns(UserWarning, match="'wall' sends light .* as the rough")
-    ):
+    with contextlib.nullcontext() if metallic else pytest.warns(UserWarning, match="sends light to other parts as"):
         mine = np.asarray(relit.picture(triple.light, triple.camera, materials=triple.materials))
     alone = np.asarray(direct.picture(triple.light, triple.camera, materials=triple.materials))
     shown = np.asarray(raster.rasterize(relit.mesh, triple.camera).triangle)[..., None] >= 0
