@@ -76,6 +76,12 @@ class Shading(eqx.Module):
         return isinstance(self.brdf, Lambert)
 
     @property
+    def albedo(self) -> Array:
+        """Albedo of an ideally diffuse surface."""
+        assert isinstance(self.brdf, Lambert)
+        return self.brdf.albedo
+
+    @property
     def layered(self) -> bool:
         """Whether there is a clear coat or a sheen."""
         return isinstance(self.table, standard.LayeredTable)

@@ -16,8 +16,6 @@ from jaxprt.image import raster
 from jaxprt.relit.channels import Shading
 from jaxprt.scene import Camera, Mesh
 from jaxprt.sphere import directions, hemisphere
-from jaxprt.systems.bright_texels import BrightTexels
-from jaxprt.systems.harmonic import HarmonicSystem
 from jaxprt.systems.protocol import System
 
 _DEGREE = 128  # degree of the harmonics that represent BRDFs
@@ -43,8 +41,7 @@ def of_part(shading: Shading, system: System) -> float:
     Returns:
         The ratio in 1 / radian^2.
     """
-    inner = system.system if isinstance(system, BrightTexels) else system
-    degree_of = inner.degree if isinstance(inner, HarmonicSystem) else None
+    degree_of = system.degree
     if shading.table is not None:
         assert shading.blend is not None
         weight = np.mean(np.asarray(shading.blend.weight, np.float64), (0, 2))

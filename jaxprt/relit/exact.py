@@ -16,7 +16,6 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 from threadpoolctl import threadpool_limits
 
-from jaxprt.brdf import Lambert
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import Between, finished
 from jaxprt.image import Pixels, front, raster, relative_l2, resolve
@@ -292,7 +291,7 @@ def _is_smooth(shading: Shading, shown: _Shown, part: int) -> bool:
     """Whether to sum the radiance of a part at its vertices: it is Lambertian, and its vertices are dense enough."""
     index = np.flatnonzero(shown.owner == part)
     vertices = len(np.unique(shown.face[np.asarray(shown.pixels.triangle)[index]]))
-    return isinstance(shading.brdf, Lambert) and vertices <= len(index) <= _COARSE * vertices
+    return shading.matte and vertices <= len(index) <= _COARSE * vertices
 
 
 def _some(own: np.ndarray, count: int) -> np.ndarray:

@@ -26,7 +26,6 @@ from jaxprt.scene.mesh import frames, join
 from jaxprt.scene.points import Points
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart
 from jaxprt.systems.bounces.traced import SharpPart
-from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.lamps import LitByLamps
 from jaxprt.systems.protocol import Blend, System
 
@@ -77,9 +76,8 @@ class Surface(eqx.Module):
 
 def sampled(surface: Surface, samples: int) -> Surface:
     """The surface with another number of sample points along the edge of each bright texel."""
-    if not isinstance(surface.system, BrightTexels) or surface.system.samples == samples:
-        return surface
-    return dataclasses.replace(surface, system=dataclasses.replace(surface.system, samples=samples))
+    system = surface.system.with_samples(samples)
+    return surface if system is surface.system else dataclasses.replace(surface, system=system)
 
 
 class Given(eqx.Module):
@@ -392,8 +390,8 @@ def surface(
     scale = None
     if shading.scale is not None and shading.blend is not None:
         scale = jax.device_put(np.asarray(shading.scale, dtype))
-    if isinstance(system, BrightTexels):
-        position, frame = put((system.visibility.position, system.visibility.frame))
+    if system.placement is not None:
+        position, frame = put(system.placement)
     else:
         pairs = [(np.asarray(own.mesh.position, dtype), frames(own.mesh.normal, own.mesh.tangent)) for own in members]
         position, frame = (

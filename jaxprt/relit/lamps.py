@@ -11,7 +11,6 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxprt.brdf import Lambert
 from jaxprt.compile import known
 from jaxprt.relit.channels import Appearance, Shading
 from jaxprt.relit.groups import Place, joined_mesh
@@ -19,7 +18,7 @@ from jaxprt.relit.recipes import Target, lobe_table
 from jaxprt.scene import PointLight, Scene
 from jaxprt.scene import origin as origins
 from jaxprt.scene.mesh import areas
-from jaxprt.systems import axes, bright_texels, lamps, lobe
+from jaxprt.systems import axes, lamps
 from jaxprt.systems.lamps import LampTransport, LitByLamps
 from jaxprt.systems.protocol import System
 
@@ -127,12 +126,10 @@ def make(
         shading, mesh = shadings[members[0]], joined_mesh([shadings[part] for part in members])
         options = target.traced() | target.options("lamps")
         transport = axes.joined([lamps.precompute(mesh, sources, apart=True, **options)], size=size)
-        if isinstance(shading.brdf, Lambert):
-            groups.append(LitByLamps(transport, albedo=shading.brdf.albedo))
+        if shading.matte:
+            groups.append(LitByLamps(transport, albedo=shading.albedo))
         else:
-            inner = system.system if isinstance(system, bright_texels.BrightTexels) else system
-            table = inner.brdf if isinstance(inner, lobe.LobeSystem) else lobe_table(shading, _LOBES)
-            groups.append(LitByLamps(transport, table))
+            groups.append(LitByLamps(transport, system.lobe_table or lobe_table(shading, _LOBES)))
     area = tuple(np.asarray(areas(shadings[number].mesh), jnp.result_type(float)) for number in emitting)
     return SceneLamps(tuple(groups), tuple(emitting), area, point_lights)
 

@@ -18,7 +18,6 @@ import tqdm
 from jaxtyping import Float
 
 from jaxprt import require
-from jaxprt.brdf import Lambert
 from jaxprt.compile import promoted
 from jaxprt.files import objects
 from jaxprt.relit import channels, groups, refinement, reflection
@@ -251,7 +250,7 @@ def _considered(sample: Sample, alone: Sample | None, folder: pathlib.Path | Non
     candidate is too slow); those close to a step that misses the error by far; and those of a system whose smallest
     step would save less than a tenth of the bytes.
     """
-    if isinstance(sample.shading.brdf, Lambert):
+    if sample.shading.matte:
         ladders: list[tuple] = [_DIFFUSE]
     else:
         ladders = [_HARMONIC, _LOBES] + ([] if alone is None else [_TERMS])

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxprt import require, visibility
-from jaxprt.brdf import Lambert
 from jaxprt.relit.channels import Shading
 from jaxprt.scene import Mesh
 from jaxprt.systems import axes, bright_texels, dynamic, harmonic, lobe, separable, standard
@@ -139,15 +138,15 @@ class Lobes(eqx.Module):
     def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
         """Precomputes the system of all vertices of the shading's mesh, padded to a number of vertices."""
         transport = _padded(_pyramid(shading.mesh, target), vertices)
-        if isinstance(shading.brdf, Lambert):
-            matte = lobe.MatteSystem(lobe.matte_transport(transport), shading.brdf.albedo)
+        if shading.matte:
+            matte = lobe.MatteSystem(lobe.matte_transport(transport), shading.albedo)
             return _bright(matte, lobe.texel_bits(transport), shading, _DIFFUSE * self.texels, transport.size)
         table = lobe_table(shading, self.lobes)
         return _bright(lobe.LobeSystem(transport, table), transport, shading, self.texels, transport.size)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
         """Smallest number of bytes: transfer vectors, and visibility as pyramids, or as bits for a Lambertian part."""
-        if isinstance(shading.brdf, Lambert):
+        if shading.matte:
             return vertices * (6 * size**2 // 8 + diffuse.count(size))
         return vertices * (pyramid.scales(size).total + diffuse.count(size))
 
@@ -175,20 +174,20 @@ class Harmonics(eqx.Module):
 
     def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
         """Precomputes the system of all vertices of the shading's mesh, padded to a number of vertices."""
-        matte = isinstance(shading.brdf, Lambert)
+        matte = shading.matte
         trace = harmonic.precompute_diffuse if matte else harmonic.precompute
         store = f"{'vectors' if matte else 'matrices'}_{self.degree}"
         size, options = min(target.size, _HARMONIC_SIZE), target.traced() | target.options(store)
         whole: Any = trace(shading.mesh, degree=self.degree, size=size, apart=True, **options)
         transport = _padded(whole, vertices)
-        if isinstance(shading.brdf, Lambert):
-            return harmonic.DiffuseSystem(transport, shading.brdf.albedo)
+        if shading.matte:
+            return harmonic.DiffuseSystem(transport, shading.albedo)
         return harmonic.HarmonicSystem(transport, harmonic_table(shading, degree=self.degree), self.laplacian)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
         """Number of bytes of the transfer vectors or matrices."""
         terms = (self.degree + 1) ** 2
-        return 4 * vertices * (terms if isinstance(shading.brdf, Lambert) else terms**2)
+        return 4 * vertices * (terms if shading.matte else terms**2)
 
 
 class Terms(eqx.Module):
@@ -214,7 +213,7 @@ class Terms(eqx.Module):
     def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
         """Precomputes the system of a part."""
         check(self, shading)
-        terms = 1 if isinstance(shading.brdf, Lambert) else self.terms
+        terms = 1 if shading.matte else self.terms
         factored = separable.factor(shading.brdf, terms=terms, resolution=self.resolution)
         keep = min(self.keep, 6 * target.size**2)
         options = {"keep": keep, "size": target.size, **target.traced(), **target.options("separable")}
@@ -275,7 +274,7 @@ class Clusters(eqx.Module):
     def _sizes(self, shading: Shading, vertices: int, size: int) -> tuple[int, int, dict[str, int]]:
         """Number of clusters, number of terms, and options of the compression, limited by the vertices and texels."""
         clusters = max(1, round(vertices / self.members))
-        terms = 1 if isinstance(shading.brdf, Lambert) else self.terms
+        terms = 1 if shading.matte else self.terms
         components, keep = min(self.components, vertices // clusters), min(self.keep, 6 * size**2)
         modes = min(self.modes, keep, components * terms)
         return clusters, terms, {"components": components, "modes": modes, "keep": keep}
@@ -314,7 +313,7 @@ class Dynamic(eqx.Module):
 
     def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
         """Precomputes the system of all vertices of the shading's mesh, padded to a number of vertices."""
-        if isinstance(shading.brdf, Lambert):
+        if shading.matte:
             return Lobes(texels=self.texels).make(shading, target, vertices=vertices)
         known = target.known
         if known is None:
@@ -329,7 +328,7 @@ class Dynamic(eqx.Module):
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
         """Number of bytes of the visibility, the weights of the components, the cores and the modes."""
-        if isinstance(shading.brdf, Lambert):
+        if shading.matte:
             return Lobes(texels=self.texels).least_bytes(shading, vertices=vertices, size=size)
         terms = 1 + (self.ranks[2] if self.ranks else 0)
         sizes = self.components, self.modes, self.keep

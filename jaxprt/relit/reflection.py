@@ -17,9 +17,8 @@ from jaxprt.scene.mesh import Opacity, frames
 from jaxprt.systems import bounces, lamps
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart, traced
 from jaxprt.systems.bounces.jobs import DEGREE
-from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.lamps import LampTransport
-from jaxprt.systems.lobe import LobeBrdf, LobeSystem
+from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.protocol import System
 
 ALL = bounces.build.ALL
@@ -149,8 +148,7 @@ def lobes(shadings: Sequence[Shading], place: Place, systems: Sequence[System]) 
         if shading.matte:
             result.append(None)
             continue
-        inner = system.system if isinstance(system, BrightTexels) else system
-        table = inner.brdf if isinstance(inner, LobeSystem) else lobe_table(shading, _LOBES)
+        table = system.lobe_table or lobe_table(shading, _LOBES)
         may = shading.table is not None or any(is_sharp(shadings[part], table) for part in own)
         result.append(table if may else None)
     return result

@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from jaxprt import require, visibility
 from jaxprt.brdf import grid
@@ -22,7 +21,6 @@ from jaxprt.scene import Environment, Mesh, Part
 from jaxprt.scene.mesh import frames
 from jaxprt.scene.points import Points, placed
 from jaxprt.systems import protocol, reference
-from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.protocol import Blend, System
 from jaxprt.visibility import members
 
@@ -223,9 +221,5 @@ def _judged(
 
 def _bytes(system: System, vertex_ratio: float) -> int:
     """Bytes of a system with `vertex_ratio` times as many vertices."""
-    if isinstance(system, BrightTexels):
-        transports: list[Array] = jax.tree.leaves((system.system.transport, system.visibility))  # pyright: ignore
-    else:
-        transports = jax.tree.leaves(system.transport)  # pyright: ignore[reportAttributeAccessIssue]
-    grown = sum({id(each): each.nbytes for each in transports}.values())
+    grown = sum({id(leaf): leaf.nbytes for leaf in jax.tree.leaves(system.growing)}.values())
     return int(protocol.memory(system) - grown + vertex_ratio * grown)

@@ -37,7 +37,6 @@ from jaxprt.scene.points import Points
 from jaxprt.systems import axes, protocol
 from jaxprt.systems.bounces import GroupBounces
 from jaxprt.systems.bounces.traced import SharpPart
-from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.protocol import Blend, System
 
@@ -772,7 +771,7 @@ def traits(shading: Shading, system: System, lobes: LobeBrdf | None) -> tuple[fl
         system: The system of its group.
         lobes: The BRDF of the group as lobes; None if nothing is traced.
     """
-    size = system.visibility.size if isinstance(system, BrightTexels) else _TEXELS
+    size = system.texel_edge or _TEXELS
     # Powers of two, so that few programs are compiled for parts of different roughness.
     samples = 1 << (samples_of(shading, size) - 1).bit_length()
     return curvature.of_part(shading, system), samples, reflection.is_sharp(shading, lobes)

@@ -157,6 +157,40 @@ class BrightTexels(VertexSystem):
         return self.system.vertices
 
     @property
+    def base(self) -> System:
+        """The underlying system."""
+        return self.system.base
+
+    @property
+    def lobe_table(self) -> Any:
+        """The lobes of the underlying system."""
+        return self.system.lobe_table
+
+    @property
+    def degree(self) -> int | None:
+        """The degree of the underlying system."""
+        return self.system.degree
+
+    @property
+    def texel_edge(self) -> int:
+        """Edge of the cubemap faces."""
+        return self.visibility.size
+
+    @property
+    def placement(self) -> tuple[Array, Array]:
+        """Positions and frames of the vertices."""
+        return self.visibility.position, self.visibility.frame
+
+    def with_samples(self, samples: int) -> "BrightTexels":
+        """The system with another number of sample points along the edge of each bright texel."""
+        return self if samples == self.samples else dataclasses.replace(self, samples=samples)
+
+    @property
+    def growing(self) -> PyTree:
+        """The transport of the underlying system, and the visibility."""
+        return self.system.growing, self.visibility
+
+    @property
     def shared_light(self) -> tuple | None:
         """Key of the light: that of the underlying system, with the number of texels."""
         rest = self.system.shared_light

@@ -117,6 +117,40 @@ class System(eqx.Module):
         """Key of the result of `light`: systems with equal keys can share it. None if it cannot be shared."""
         return None
 
+    @property
+    def base(self) -> "System":
+        """The system without the exact sum over the brightest texels."""
+        return self
+
+    @property
+    def lobe_table(self) -> Any:
+        """The BRDF as a `jaxprt.lobe.LobeBrdf`; None if the system has another form of it."""
+        return None
+
+    @property
+    def degree(self) -> int | None:
+        """Degree of the harmonics of the view beyond which radiance has nothing; None if there is no limit."""
+        return None
+
+    @property
+    def texel_edge(self) -> int | None:
+        """Edge of the cubemap faces whose brightest texels are summed exactly; None if none are."""
+        return None
+
+    @property
+    def placement(self) -> tuple[Array, Array] | None:
+        """Positions and frames of the vertices, where the system holds them for the sum over bright texels."""
+        return None
+
+    def with_samples(self, samples: int) -> "System":
+        """The system with another number of sample points along the edge of each bright texel."""
+        return self
+
+    @property
+    def growing(self) -> PyTree:
+        """What has a row for each vertex, to estimate bytes."""
+        return getattr(self, "transport", self)
+
 
 class VertexSystem(System):
     """A system for the vertices of one mesh, or for points on its triangles.

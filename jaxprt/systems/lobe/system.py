@@ -127,6 +127,11 @@ class LobeSystem(protocol.VertexSystem):
         return combine(light, view)
 
     @property
+    def lobe_table(self) -> LobeBrdf:
+        """The BRDF."""
+        return self.brdf
+
+    @property
     def vertices(self) -> int:
         """Number of vertices, or of points where radiance is evaluated at points."""
         return len(self.transport.position if self.points is None else self.points)
