@@ -131,7 +131,7 @@ def measure(
     for count in counts:
         start = time.perf_counter()
         target = Target(scene.mesh, size=16, progress=False)
-        system = reflection.make(scene.shadings, place, count, target, changing=[True] * len(sizes))
+        system = reflection.make(scene.shadings, place, count, target)
         seconds = time.perf_counter() - start
         blends = [each.blend for each in scene.shadings]
         frame = harness.measure(lambda: _radiance(system, scene, blends), repeats=2 if quick else 10)  # noqa: B023

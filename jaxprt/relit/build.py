@@ -136,9 +136,8 @@ def precompute(
     if bounces:
         # One store serves any number of bounces: a larger number resumes from a smaller one.
         target = Target(mesh, path=folder and folder / "scene", **options)
-        changing = [recipes[members[0]].changing for members in place.parts]
         lamp = lit and lit.transport(place)
-        reflected = reflection.make(shadings, place, bounces, target, changing=changing, lamp=lamp)
+        reflected = reflection.make(shadings, place, bounces, target, lamp=lamp)
         lobes = reflection.lobes(shadings, place, systems) if rays else None
     given = {"lamps": lit, "lobes": lobes, "rays": rays, "division": divided, "copied": copied}
     return RelitScene(scene, shadings, place, systems, reflected, **given)

@@ -6,7 +6,7 @@ table of their weights over roughness.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -27,7 +27,6 @@ _TERMS, _RESOLUTION = 24, 32  # number of terms, and edge of the maps, of BRDFs 
 _FUNCTIONS = 2  # number of functions that represent lobes of any roughness
 _STEP = 1.2  # largest ratio of neighboring roughnesses between which weights are interpolated linearly
 _WIDTH = 0.09  # smallest width of lobes along light paths: alpha of GGX, or m of Beckmann's distribution
-_WIDE, _GLOSSY = 0.3, 0.2  # roughness, and share of lobes in the albedo, with which parts count as diffuse to others
 _SAME = 1e-5  # relative tolerance for equal parameters, which may be means with different rounding
 _DARK = 1e-6  # smaller albedo counts as zero
 _VIEWS = 16  # number of view angles over which albedo is averaged
@@ -88,35 +87,6 @@ def _factored(alone: Callable, brdf: Callable, knot: tuple[np.ndarray, ...]) -> 
     factor *= np.where(kept > _DARK, true / np.maximum(kept, _DARK), 1)[..., None]
     dtype = shared.view_map.dtype
     return Path(shared, Sent(tuple(jnp.asarray(each, dtype) for each in knot), jnp.asarray(factor, dtype)))
-
-
-def of_group(shadings: Sequence[Shading]) -> Path:
-    """The factored BRDF with which the parts of a group send light.
-
-    Parts that reflect most of their light diffusely, and the rest in wide lobes, send all of it diffusely, with the
-    same albedo. That is a tenth of the work, and changes little of what arrives in low-order harmonics.
-    """
-    path = factored(shadings[0])
-    if path.sent is None or not all(sends_diffusely(shading, path) for shading in shadings):
-        return path
-    albedo = path.sent.factor @ bounces.functions.albedo(path.brdf)
-    flat = jnp.ones((1, 4, 4, 1), albedo.dtype)
-    lambert = separable.SeparableBrdf(flat, flat / np.pi, path.brdf.error, path.brdf.coordinates)
-    return Path(lambert, Sent(path.sent.knot, albedo[..., None]))
-
-
-def sends_diffusely(shading: Shading, path: Path) -> bool:
-    """Whether a part sends little light by lobes, and none by narrow ones.
-
-    Args:
-        shading: The `Shading` of the part.
-        path: The result of `factored` for it.
-    """
-    if shading.layered or shading.blend is None or shading.smoothest < np.log(_WIDE):
-        return False
-    weight = np.asarray(typical(shading, path), np.float64)
-    albedo = np.asarray(bounces.functions.albedo(path.brdf), np.float64)[:, None] * weight
-    return bool(np.abs(albedo[:-1]).sum(0).max() <= _GLOSSY * np.abs(albedo).sum(0).max())
 
 
 def typical(shading: Shading, path: Path) -> Float[Array, "p c"] | None:

@@ -95,12 +95,9 @@ class Recipe(Protocol):
 
     Attributes:
         joins: Whether parts with one BRDF share a system.
-        changing: Whether parts send light to each other by lobes whatever their materials are at precomputation, since
-            they are made to change. Otherwise parts that are rough dielectrics send it diffusely.
     """
 
     joins: ClassVar[bool]
-    changing: ClassVar[bool]
 
     def takes(self, table: StandardTable) -> bool:
         """Whether the system reads a standard table; otherwise parts have BRDFs of their own."""
@@ -126,7 +123,6 @@ class Lobes(eqx.Module):
     """
 
     joins: ClassVar = True
-    changing: ClassVar = False
 
     lobes: int = 12
     texels: int = 16
@@ -163,7 +159,6 @@ class Harmonics(eqx.Module):
     """
 
     joins: ClassVar = True
-    changing: ClassVar = False
 
     degree: int = 4
     laplacian: float = 1.0
@@ -200,7 +195,6 @@ class Terms(eqx.Module):
     """
 
     joins: ClassVar = False
-    changing: ClassVar = False
 
     terms: int = 4
     keep: int = 96
@@ -234,7 +228,6 @@ class Clusters(eqx.Module):
     """
 
     joins: ClassVar = False
-    changing: ClassVar = False
 
     terms: int = 32
     resolution: int = 64
@@ -283,8 +276,6 @@ class Clusters(eqx.Module):
 class Dynamic(eqx.Module):
     """Recipe of the dynamic system: lobes, and a tensor for what they leave. The brightest texels are summed exactly.
 
-    With bounces, parts send light to each other by lobes, also if they are rough dielectrics at precomputation.
-
     A Lambertian part has the system of `Lobes`.
 
     Attributes:
@@ -298,7 +289,6 @@ class Dynamic(eqx.Module):
     """
 
     joins: ClassVar = True
-    changing: ClassVar = True
 
     lobes: int = 12
     ranks: tuple[int, int, int] | None = eqx.field(default=standard.RANKS, converter=lambda x: x and tuple(x))

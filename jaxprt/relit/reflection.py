@@ -53,7 +53,6 @@ def make(
     count: int | str,
     target: Target,
     *,
-    changing: Sequence[bool],
     lamp: LampTransport | None = None,
 ) -> GroupBounces:
     """Precomputes the light of the environment and of lamps that all parts reflect onto each other and themselves.
@@ -66,18 +65,13 @@ def make(
         place: Where the vertices of the parts stand in their groups.
         count: Number of bounces, at least 1; or "all".
         target: Size of the light, and where and how to compute. All parts occlude each other, and all vertices are lit.
-        changing: Whether the parts of each group send light by lobes in any case; see `Recipe.changing`.
         lamp: Transport of the lamps to the vertices of all parts; None without lamps.
 
     Returns:
         The system of reflected light alone.
     """
     first = [shadings[own[0]] for own in place.parts]
-    pairs = zip(place.parts, changing, strict=True)
-    of_group = [
-        paths.factored(shadings[members[0]]) if free else paths.of_group([shadings[part] for part in members])
-        for members, free in pairs
-    ]
+    of_group = [paths.factored(shading) for shading in first]
     typical = [paths.typical(shading, of_group[group]) for shading, group in zip(shadings, place.group, strict=True)]
     region, members = _regions(place, typical)
     mesh = dataclasses.replace(

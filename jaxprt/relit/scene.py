@@ -2,7 +2,6 @@
 
 import dataclasses
 import typing
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,7 +16,7 @@ from jaxprt import require
 from jaxprt.brdf import grid
 from jaxprt.compile import Between, compile_time, known, promoted, put
 from jaxprt.image import automatic_exposure, pixels, raster
-from jaxprt.relit import channels, curvature, groups, measuring, paths, pictures, reflection, tracing
+from jaxprt.relit import channels, curvature, groups, measuring, pictures, reflection, tracing
 from jaxprt.relit import lamps as scene_lamps
 from jaxprt.relit.casting import caster
 from jaxprt.relit.channels import Appearance, Changeable, Shading, appearance
@@ -391,24 +390,9 @@ class RelitScene(System):
             if given.blend is not None and shading.table is not None and known(given):
                 number = self.place.group[part]
                 new = dataclasses.replace(shading, blend=given.blend)
-                self._warn_of_lobes(part, new)
                 rows[part] = traits(new, self.surfaces[number].system, self.lobes[number])
         bend, samples, sharp = zip(*rows, strict=True)
         return list(bend), samples, sharp
-
-    def _warn_of_lobes(self, part: int, new: Shading) -> None:
-        """Warns if a part that sends light diffusely to others gets a material that would send it by lobes."""
-        if self.bounces is None:
-            return
-        sent = self.bounces.group[self.place.group[part]].sent
-        if sent is None or sent.factor.shape[-1] > 1 or paths.sends_diffusely(new, paths.factored(new)):
-            return
-        warnings.warn(
-            f"part {self.scene.parts[part].name!r} sends light to other parts as the rough dielectric that it was "
-            "precomputed as, though its material is glossy now: precompute it with a glossy material, or with "
-            'system="dynamic"',
-            stacklevel=3,
-        )
 
     def _surface(self, number: int, sharp: Sequence[bool]) -> Surface:
         """A group, with rays for its reflections if any of its parts is sharp."""

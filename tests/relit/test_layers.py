@@ -167,7 +167,7 @@ def spheres(*materials: TexturedMaterial) -> Scene:
 
 def test_layers_cost_nothing_where_no_material_has_them():
     plain = material_table.of_parts(spheres(TexturedMaterial(0.5, 0.0, 0.4)).parts)
-    assert (plain.layered, plain.image.shape[1], plain.factor.shape[1]) == (False, len(material_table.TEXTURES), 14)
+    assert (plain.layered, plain.image.shape[1], plain.factor.shape[1]) == (False, len(material_table.TEXTURES), 17)
     look = plain.at_vertices()
     assert look.coefficient.shape[1] == 4
     assert look.log_layer is None

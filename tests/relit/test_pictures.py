@@ -148,7 +148,7 @@ def test_bounces_are_in_the_picture():
 def test_pictures_have_other_materials(name, close):
     ready = relit()
     if name == "ball":
-        with pytest.raises(TypeError, match="is a BRDF, which cannot be replaced"):
+        with pytest.raises(TypeError, match="of part 'ball' must be a CookTorrance, got TexturedMaterial"):
             ready.picture(light(), CAMERA, materials={"ball": matte()})
         return
     half = {"floor": matte(base_color=0.5)}

@@ -18,7 +18,7 @@ import jaxprt as prt
 from jaxprt import bounces, bright_texels, harmonic, lobe, separable, visibility
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.image import automatic_exposure, raster, sky
-from jaxprt.relit import Clusters, Harmonics, Lobes, RelitScene, Terms, measuring, reflection
+from jaxprt.relit import Clusters, Dynamic, Harmonics, Lobes, RelitScene, Terms, measuring, reflection
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.recipes import SYSTEMS
 from jaxprt.scene import Camera, Environment, Mesh, Part, Scene, TexturedMaterial, builtin
@@ -469,12 +469,12 @@ def test_a_second_call_with_the_same_folder_traces_nothing(tmp_path, monkeypatch
 
 
 def test_names_of_systems_are_sizes_of_them():
-    assert set(SYSTEMS) == {"lobe", "harmonic", "separable"}
-    assert all(isinstance(each, Lobes | Harmonics | Terms | Clusters) for each in SYSTEMS.values())
+    assert set(SYSTEMS) == {"dynamic", "lobe", "harmonic", "separable"}
+    assert all(isinstance(each, Dynamic | Lobes | Harmonics | Terms | Clusters) for each in SYSTEMS.values())
 
 
 BAD = {
-    "unknown": ("fast", ValueError, "the system must be one of harmonic, lobe, separable, got 'fast'"),
+    "unknown": ("fast", ValueError, "the system must be one of dynamic, harmonic, lobe, separable, got 'fast'"),
     "kind": (
         3,
         TypeError,
@@ -522,9 +522,9 @@ MATERIALS = {
     "kind": (
         {"floor": GLOSSY},
         TypeError,
-        "'floor' must be of class TexturedMaterial or BlinnPhong or CookTorrance or Appearance or Blend, which",
+        "the material of part 'floor' must be a TexturedMaterial, got CookTorrance",
     ),
-    "brdf": ({"ball": wood()}, TypeError, "the material of part 'ball' is a BRDF, which cannot be replaced"),
+    "brdf": ({"ball": wood()}, TypeError, "the material of part 'ball' must be a CookTorrance, got TexturedMaterial"),
     "shape": (
         {"floor": prt.Blend(jnp.ones((3, 3, 3)), (jnp.zeros(3),))},
         ValueError,

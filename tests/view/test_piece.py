@@ -293,7 +293,7 @@ def test_what_a_page_does_not_have_is_refused(systems, tmp_path):
 
     refused(
         prt.total(ball, ball),
-        "made by the system 'lobe', 'dynamic' or 'harmonic' to be exported, got",
+        "be ideally diffuse or made by the system 'lobe', 'dynamic' or 'harmonic' to be exported, got",
     )
     matrix = ball.transport.matrix
     reflected = eqx.tree_at(lambda each: each.transport.matrix, ball, matrix.at[:, 0, 0, 1].add(0.5))

@@ -515,7 +515,13 @@ def test_headers_of_all_traced_systems_name_versions_and_no_computed_float(spher
     mesh, brdf = sphere
     rows, white = np.ones((156, 1, 4, 4), np.float32), np.ones(1, np.float32)
     more = {"region": np.zeros(156, int), "member": np.arange(156)[None], "white": white, "scale": white}
-    more |= {"bases": (brdf,), "response": (np.ones((156, 6, 2), np.float32),), "components": 1}
+    more |= {
+        "bases": (brdf,),
+        "basis": np.zeros(1, int),
+        "lamps": 0,
+        "response": (np.ones((156, 6, 2), np.float32),),
+        "components": 1,
+    }
     kinds = [
         (separable.sparse._Job, {"brdf": brdf, "keep": 3}),
         (visibility.stored._Job, {}),

@@ -8,6 +8,7 @@ Lights, eyes and probes must be finite. Values cannot be checked inside `jax.jit
 in a light or an eye reaches every vertex, and NaN at a probe reaches every vertex with a weight of it.
 """
 
+import math
 from functools import partial
 from typing import Any
 
