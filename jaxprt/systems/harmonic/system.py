@@ -8,7 +8,6 @@ Lights, eyes and probes must be finite. Values cannot be checked inside `jax.jit
 in a light or an eye reaches every vertex, and NaN at a probe reaches every vertex with a weight of it.
 """
 
-import math
 from functools import partial
 from typing import Any
 
@@ -180,9 +179,10 @@ def _coefficients(light: Any, degree: int) -> Float[Array, "lm c *w"]:
     """SH coefficients of one light, which may be given as such."""
     if getattr(light, "ndim", 0) not in (2, 3):
         return project(protocol.one_light(light), degree=degree)
-    rows = int(light.shape[0])
-    if rows != (degree + 1) ** 2:
-        got = math.isqrt(rows) - 1 if rows and math.isqrt(rows) ** 2 == rows else f"{rows} coefficients"
+    if not light.shape[0]:
+        raise ValueError(f"the light must have {(degree + 1) ** 2} coefficients, got none")
+    if harmonics.degree_of(light.shape[0]) != degree:
+        got = harmonics.degree_of(light.shape[0])
         raise ValueError(f"the light must have the transport's degree {degree}, got {got}")
     return _light(light)
 
