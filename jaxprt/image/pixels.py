@@ -457,7 +457,7 @@ def visible_points(
     """The shading points of a picture, and how much each adds to its pixel.
 
     A point on a translucent surface covers the share of its samples that it hides; what lies behind it covers the rest.
-    Of more than eight translucent surfaces in front of an opaque one, those behind the eighth are left out.
+    At most eight translucent surfaces in front of an opaque one are drawn; those behind the eighth are omitted.
 
     Args:
         mesh: The mesh, whose opacity is ignored.

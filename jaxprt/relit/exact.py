@@ -191,7 +191,8 @@ def exact_picture(
         camera = dataclasses.replace(camera, **size)
         shown = _Shown.of(scene, camera)
     lights = Environment(jnp.stack([each.radiance for each in environments]))
-    color = np.zeros((len(environments), len(shown.owner), lights.radiance.shape[-1]), np.float32)
+    # Surfaces and lamps may have colors where the light is gray.
+    color, colors = np.zeros((len(environments), len(shown.owner), 3), np.float32), lights.radiance.shape[-1]
     options = {"eye": camera.eye, "occluder": scene.mesh, "progress": progress, "between": between}
     for number, (part, shading) in enumerate(zip(scene.parts, shadings, strict=True)):
         index = np.flatnonzero(shown.owner == number)
@@ -200,7 +201,7 @@ def exact_picture(
         points = shown.points(index, number)
         if smooth[number]:
             vertex = np.unique(points.corner)
-            every = np.zeros((len(color), len(part.mesh.position), color.shape[-1]), color.dtype)
+            every = np.zeros((len(color), len(part.mesh.position), 3), color.dtype)
             every[:, vertex] = _sum(shading.mesh, shading.brdf, lights, vertex, **options)
             look = at_points(part, shading, None, points)
             value, emitted = points.carry(jnp.asarray(every), axis=1), look.emitted
@@ -209,7 +210,9 @@ def exact_picture(
             brdf, emitted, points = exact_at(part, shading, points)
             value = _sum(shading.mesh, brdf, lights, points, **options)
             value = value + lamps.at_points(shading.mesh, brdf, points, jnp.asarray(camera.eye))
-        color[:, index] = value if emitted is None else value + emitted
+        value = value if emitted is None else value + emitted
+        color[:, index], colors = value, max(colors, value.shape[-1])
+    color = color[..., :colors]
     behind = [sky(each, camera) for each in environments]
     pictures = [resolve(shown.pixels, a, background=b) for a, b in zip(color, behind, strict=True)]
     if (camera.width, camera.height) != (asked.width, asked.height):

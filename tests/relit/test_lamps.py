@@ -10,7 +10,7 @@ import pytest
 import jaxprt as prt
 from jaxprt import lobe
 from jaxprt.brdf import Lambert
-from jaxprt.relit import Harmonics, RelitScene, exact_lamps, probes, reflection
+from jaxprt.relit import Harmonics, RelitScene, exact, exact_lamps, probes, reflection
 from jaxprt.relit.channels import of_part
 from jaxprt.scene import Camera, Environment, Part, PointLight, Scene, TexturedMaterial, builtin
 from jaxprt.scene.environment import background
@@ -231,6 +231,22 @@ def test_reports_measure_lamps_too():
     report = relit().report([DARK])
     assert 0 < report.part[0].errors[0] < 0.2
     assert 0 < report.part[0].vertex_errors[0] < 0.2
+
+
+def test_lamps_that_are_off_reflect_nothing():
+    ready = hollow(2)
+    blends = [appearance.blend for appearance in ready.appearance]
+    (arriving,) = ready.bounces.shade(ready.light(DARK).transferred, blends)
+    np.testing.assert_array_equal(arriving, 0)
+
+
+def test_exact_pictures_under_gray_light_have_the_colors_of_lamps():
+    gray = Environment(jnp.full((6, 8, 8, 1), 0.3))
+    parts = scene().parts
+    picture = exact.exact_picture(scene(), [of_part(part) for part in parts], [gray], CAMERA).color[0]
+    close_to = np.asarray(relit().picture(gray, CAMERA))
+    assert picture.shape == close_to.shape == (16, 24, 3)
+    assert np.linalg.norm(picture - close_to) < 0.1 * np.linalg.norm(picture)
 
 
 def test_plans_count_what_surfaces_reflect_of_lamps():

@@ -17,7 +17,7 @@ from jaxprt.systems import bounces, standard
 from jaxprt.systems.protocol import Blend
 from jaxprt.view.reduced import without_layers
 
-# Of the table of albedos of sheens: above three degrees over the horizon, and below, where views of the last step are.
+# Errors of the table of albedos of sheens: for views above three degrees over the horizon, and for views below.
 ALBEDO, ALBEDO_AT_HORIZON = 0.004, 0.009
 TABLE = 0.03  # error of 12 and 12 lobes, of light of medium width
 EYE = np.array([0.0, 0.0, 5.0])

@@ -251,7 +251,7 @@ def decode_meshopt(
     Args:
         document: The file.
         view: The buffer view.
-        extension: Its extension.
+        extension: The object of EXT_meshopt_compression in the buffer view.
         content: The compressed bytes.
         name: Name of the view, for messages.
 

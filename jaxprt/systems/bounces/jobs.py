@@ -202,7 +202,7 @@ class TransferJob(_PathJob):
         tensor, lamp = np.split(whole, [whole.shape[1] - self.lamps], 1)
         count, light, harmonic, functions = tensor.shape
         flat = (tensor * self.scale).reshape(count, light, -1)
-        weight, core, mode, error = compressed(flat, components=self.components, modes=self.modes)
+        weight, core, mode, error = compress(flat, components=self.components, modes=self.modes)
         core = core.reshape(1, *core.shape[:2], harmonic, functions) / self.scale
         white = self.brought(tensor, self.member[block], self.white)
         energy = np.sum(whole**2, (0, 1, 2))[None]
@@ -313,7 +313,7 @@ class AgainJob(_PathJob):
         return found.transpose(0, 3, 1, 4, 2)
 
 
-def compressed(
+def compress(
     tensor: Float[np.ndarray, "m l f"], *, components: int, modes: int
 ) -> tuple[Float[np.ndarray, "m n"], Float16[np.ndarray, "e n f"], Float[np.ndarray, "l e"], float]:
     """Decomposes the tensor of a cluster along the vertices, and then along the light.

@@ -170,7 +170,7 @@ class GroupBounces(eqx.Module):
         Args:
             light: The result of `light`.
             materials: Weights at the vertices of each group; None for a group with a BRDF that cannot change.
-            lamp: Radiance of each lamp; None without lamps.
+            lamp: Radiance of each lamp; None for lamps that are off, and without lamps.
 
         Raises:
             ValueError: The tensor was made for another number of lamps.

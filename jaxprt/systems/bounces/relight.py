@@ -226,8 +226,10 @@ def collect(
         light: Result of `light_side`.
         weight: Result of `weights`.
         change: Result of `changes`; None for zero.
-        lamp: Radiance of each lamp; None without lamps.
+        lamp: Radiance of each lamp; None for lamps that are off, and without lamps.
     """
+    if lamp is None and tensor.lamps:
+        lamp = jnp.zeros((tensor.lamps, 1), weight.dtype)
     # Multiply and sum along the last axes: for an einsum, XLA on CPUs would transpose the large operands first.
     met, row, matte = jnp.sum(light.first * weight.T[:, None, None], -1), tensor.weight, light.matte
     if lamp is not None and tensor.lamp is not None:

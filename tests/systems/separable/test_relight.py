@@ -34,7 +34,7 @@ def factored():
 
 @pytest.fixture(scope="module")
 def transport(factored):
-    """Of seven vertices with random frames and visibility."""
+    """Transport of seven vertices with random frames and visibility."""
     random = np.random.default_rng(4)
     frame, _ = np.linalg.qr(random.normal(size=(7, 3, 3)))
     frame = array(frame * np.linalg.det(frame)[:, None, None])
