@@ -213,7 +213,7 @@ def exact_picture(
         value = value if emitted is None else value + emitted
         color[:, index], colors = value, max(colors, value.shape[-1])
     color = color[..., :colors]
-    behind = [sky(each, camera) for each in environments]
+    behind = [jnp.broadcast_to(sky(light, camera), (camera.height, camera.width, colors)) for light in environments]
     pictures = [resolve(shown.pixels, a, background=b) for a, b in zip(color, behind, strict=True)]
     if (camera.width, camera.height) != (asked.width, asked.height):
         asked = dataclasses.replace(asked, width=camera.width, height=camera.height)
