@@ -157,11 +157,6 @@ class BrightTexels(VertexSystem):
         return self.system.vertices
 
     @property
-    def base(self) -> System:
-        """The underlying system."""
-        return self.system.base
-
-    @property
     def lobe_table(self) -> Any:
         """The lobes of the underlying system."""
         return self.system.lobe_table

@@ -118,11 +118,6 @@ class System(eqx.Module):
         return None
 
     @property
-    def base(self) -> "System":
-        """The system without the exact sum over the brightest texels."""
-        return self
-
-    @property
     def lobe_table(self) -> Any:
         """The BRDF as a `jaxprt.lobe.LobeBrdf`; None if the system has another form of it."""
         return None
