@@ -103,6 +103,7 @@ def precompute(
     scene, copied = sides.with_copies(scene)
     _check_options(size, error, rate, environments, rays, path, executor)
     reflection.check(bounces)
+    recipes = None if system is None else _recipes(system, scene)
     folder = None if path is None else pathlib.Path(path)
     if folder is not None:
         if folder.exists() and not folder.is_dir():
@@ -111,12 +112,11 @@ def precompute(
     scene, divided = refinement.divided(
         scene, refine, vertices=vertices, environments=environments, folder=folder, progress=progress
     )
-    if system is None:
+    if recipes is None:
         wanted = _planned(scene, folder, environments=environments, error=error, rate=rate, progress=progress)
-        system, size = wanted.recipes, wanted.size if size is None else size
+        recipes, size = _recipes(wanted.recipes, scene), wanted.size if size is None else size
         bounces = wanted.bounces if bounces is None else bounces
     size = 64 if size is None else size
-    recipes = [_recipe(system, part.name, scene) for part in scene.parts]
     near = centered(scene)
     shadings = shaded(near.parts, recipes)
     scene = dataclasses.replace(scene, parts=list(map(channels.as_shaded, scene.parts, shadings)))
@@ -222,6 +222,11 @@ def _plan(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
     return made
 
 
+def _recipes(system: str | Recipe | Mapping[str, str | Recipe], scene: Scene) -> list[Recipe]:
+    """The recipe of each part."""
+    return [_recipe(system, part.name, scene) for part in scene.parts]
+
+
 def _recipe(system, name: str, scene: Scene) -> Recipe:
     """The recipe of the part of a name."""
     if isinstance(system, Mapping):
@@ -234,7 +239,7 @@ def _recipe(system, name: str, scene: Scene) -> Recipe:
         if system not in SYSTEMS:
             raise ValueError(f"the system must be one of {', '.join(SYSTEMS)}, got {system!r}")
         return SYSTEMS[system]
-    require.kind("the system", system, Recipe, source="jaxprt.relit.Lobes, Harmonics, Terms or Clusters")
+    require.kind("the system", system, Recipe, source="jaxprt.relit.Lobes, Harmonics, Dynamic, Terms or Clusters")
     return system
 
 

@@ -297,6 +297,20 @@ class Dynamic(eqx.Module):
     keep: int = 1024
     texels: int = 16
 
+    def __check_init__(self):
+        """Refuses numbers that no system has."""
+        require.count("lobes", self.lobes, least=0)
+        if self.ranks is not None:
+            if len(self.ranks) != 3:
+                raise ValueError(f"ranks must be three, of the BRDFs, the view and the light, got {self.ranks}")
+            for rank in self.ranks:
+                require.count("each rank", rank, least=1)
+        elif not self.lobes:
+            raise ValueError("the dynamic system needs lobes, or ranks of a tensor, or both; got neither")
+        for name in ("components", "modes", "keep"):
+            require.count(name, getattr(self, name), least=1)
+        require.count("texels", self.texels, least=0)
+
     def takes(self, table: StandardTable) -> bool:
         """Whether tables with this number of lobes and these ranks are shipped."""
         return table.has_tensor(self.lobes, self.ranks)

@@ -18,7 +18,7 @@ import jaxprt as prt
 from jaxprt import bounces, bright_texels, harmonic, lobe, separable, visibility
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.image import automatic_exposure, raster, sky
-from jaxprt.relit import Clusters, Dynamic, Harmonics, Lobes, RelitScene, Terms, measuring, reflection
+from jaxprt.relit import Clusters, Dynamic, Harmonics, Lobes, RelitScene, Terms, measuring, refinement, reflection
 from jaxprt.relit.channels import of_part
 from jaxprt.relit.recipes import SYSTEMS
 from jaxprt.scene import Camera, Environment, Mesh, Part, Scene, TexturedMaterial, builtin
@@ -478,7 +478,7 @@ BAD = {
     "kind": (
         3,
         TypeError,
-        "the system must be of class Recipe, which jaxprt.relit.Lobes, Harmonics, Terms or Clusters",
+        "the system must be of class Recipe, which jaxprt.relit.Lobes, Harmonics, Dynamic, Terms or Clusters",
     ),
     "missing": ({"floor": "lobe"}, ValueError, r"for each of the parts ['floor', 'ball', 'wall'], got ['floor']"),
     "more": (dict.fromkeys([*NAMES, "roof"], "lobe"), ValueError, "'wall'], got ['floor', 'ball', 'wall', 'roof']"),
@@ -498,6 +498,29 @@ def test_systems_that_a_scene_cannot_have_are_refused_before_rays_are_traced(nam
     monkeypatch.setattr(visibility.rays, "fractional", None)
     with pytest.raises(error, match=re.escape(message)):
         prt.precompute(scene(), refine=False, system=system, size=SIZE, progress=False)
+
+
+@pytest.mark.parametrize("name", ["unknown", "kind", "missing", "more"])
+@pytest.mark.usefixtures("unchecked")
+def test_systems_that_do_not_exist_are_refused_before_meshes_are_divided(name, monkeypatch):
+    system, error, message = BAD[name]
+    monkeypatch.setattr(refinement, "divided", None)
+    with pytest.raises(error, match=re.escape(message)):
+        prt.precompute(scene(), system=system, size=SIZE, progress=False)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_numbers_that_no_dynamic_system_has_are_refused():
+    for options, error, message in (
+        ({"ranks": (0, 8, 8)}, ValueError, "each rank must be at least 1, got 0"),
+        ({"ranks": (8, 8)}, ValueError, r"ranks must be three, of the BRDFs, the view and the light, got \(8, 8\)"),
+        ({"lobes": 0, "ranks": None}, ValueError, "needs lobes, or ranks of a tensor, or both; got neither"),
+        ({"lobes": -1}, ValueError, "lobes must be at least 0, got -1"),
+        ({"modes": 0}, ValueError, "modes must be at least 1, got 0"),
+        ({"texels": 1.5}, TypeError, "texels must be a whole number, got 1.5"),
+    ):
+        with pytest.raises(error, match=message):
+            Dynamic(**options)
 
 
 @pytest.mark.usefixtures("unchecked")
