@@ -6,6 +6,7 @@ docs/architecture.md says the same to readers, and names only what exists.
 """
 
 import ast
+import builtins
 import functools
 import graphlib
 import importlib
@@ -334,3 +335,27 @@ def test_the_table_forbids(importer, imported):
 )
 def test_the_table_allows(importer, imported):
     assert violation(importer, imported) is None
+
+
+def test_every_name_that_a_module_reads_is_bound_in_it():
+    """Linters take the shapes of annotations for names, so they are told not to look for unbound names."""
+    missing = {}
+    for module, text in TEXTS.items():
+        loads, bound = set(), set(dir(builtins)) | {"__file__", "__path__"}
+        for node in ast.walk(ast.parse(text)):
+            match node:
+                case ast.Name(id=name, ctx=ast.Load()):
+                    loads.add(name)
+                case ast.Name(id=name):
+                    bound.add(name)
+                case ast.FunctionDef(name=name) | ast.ClassDef(name=name) | ast.AsyncFunctionDef(name=name):
+                    bound.add(name)
+                case ast.arg(arg=name):
+                    bound.add(name)
+                case ast.alias(name=name, asname=other):
+                    bound.add(other or name.partition(".")[0])
+                case ast.ExceptHandler(name=str(name)) | ast.MatchAs(name=str(name)) | ast.MatchStar(name=str(name)):
+                    bound.add(name)
+        if loads - bound:
+            missing[module] = sorted(loads - bound)
+    assert not missing

@@ -40,7 +40,7 @@ _PLAIN: dict[Any, tuple[type, ...]] = {
     float: (float, int, np.floating, np.integer),
     str: (str,),
 }
-VERSION = 2
+VERSION = 3
 FORMAT = "jaxprt object"
 HEADER = "object.json"
 # Functions that fields may hold. Files and pickles store their names.
@@ -190,7 +190,8 @@ def load_folder(path: Path) -> Any:
     version, text = header.get("version"), header.get("content")
     if version != VERSION or type(version) is not int:
         newer = isinstance(version, int) and version > VERSION
-        cure = "update jaxprt" if newer else "load it with the version of jaxprt that saved it"
+        earlier = "precompute and save it anew, or load it with the version of jaxprt that saved it"
+        cure = "update jaxprt" if newer else earlier
         raise ValueError(
             f"{path} must have format version {VERSION}, got {str(version)[:80]}: {cure}, or it is damaged"
         )

@@ -9,28 +9,11 @@ import pytest
 from benchmarks.published.lobes import Remainder, mirror_lobes
 from jaxprt import lobe
 from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert
+from tests.upper import directions, nodes, upper
 
 RESOLUTION = 8
 GLOSSY = CookTorrance(diffuse=0.2, specular=0.5, roughness=0.2)
 COLORED = AshikhminShirley(diffuse=[0.5, 0.2, 0.1], specular=[0.2, 0.4, 0.6], nu=10.0, nv=100.0)
-
-
-def directions(*polar):
-    """Unit vectors of (angle to the normal, angle about it)."""
-    theta, phi = np.array(polar).T
-    vector = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
-    return jnp.asarray(vector.astype(np.float32))
-
-
-def upper(seed, count, least=0.0):
-    """Unit vectors at least so high above the horizon."""
-    random = np.random.default_rng(seed)
-    return directions(*np.stack([np.arccos(random.uniform(least, 1, count)), random.uniform(0, 6.28, count)], -1))
-
-
-def nodes(resolution=RESOLUTION):
-    """Views at which an isotropic table is made, but for the one at the horizon."""
-    return directions(*((2 * np.arctan(r), 0.0) for r in np.linspace(0, 1, resolution)[:-1]))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -73,7 +56,7 @@ def test_published_lobes_are_in_the_mirror_direction_and_have_the_given_widths()
     expected = np.array([lobe.em.FINEST, *(1 / (np.radians([7, 21]) / 3) ** 2)])
     np.testing.assert_allclose(jnp.exp(table.scale), np.outer(expected, np.ones(RESOLUTION)), rtol=1e-4)
     np.testing.assert_array_equal(table.diffuse, 0)
-    wo = nodes()
+    wo = nodes(RESOLUTION)
     found = table.lookup(wo).mean
     np.testing.assert_allclose(found, np.asarray(lobe.em.mirror(wo)).T[:, None] * np.ones((3, 3, 1)), atol=1e-6)
 

@@ -293,11 +293,11 @@ def test_other_versions_of_the_format_the_algorithm_or_a_class_are_refused(tmp_p
     with pytest.raises(ValueError, match=r"algorithm in jaxprt.systems.separable.sparse, this jaxprt has version 77"):
         prt.files.load(path)
     monkeypatch.undo()
-    for version, cure in ((99, "update jaxprt"), (0, "load it with the version of jaxprt that saved it")):
+    for version, cure in ((99, "update jaxprt"), (2, "precompute and save it anew, or load it with")):
         headed(path, version=version)
-        with pytest.raises(ValueError, match=f"must have format version 2, got {version}: {cure}"):
+        with pytest.raises(ValueError, match=f"must have format version 3, got {version}: {cure}"):
             prt.files.load(path)
-    headed(path, version=2)
+    headed(path, version=3)
     rewritten(path, tree={"class": "jaxprt.scene.environment:Environment", "field": {"light": {"value": 1}}})
     with pytest.raises(ValueError, match="with the fields light, this jaxprt's has radiance"):
         prt.files.load(path)
@@ -348,7 +348,7 @@ def test_arrays_of_devices_are_maps_of_their_files_on_cpus_and_those_of_the_host
 def test_objects_that_zarr_saved_are_refused_by_their_version(tmp_path):
     header = {"zarr_format": 3, "attributes": {"format": "jaxprt object", "version": 1, "content": "{}"}}
     (tmp_path / "zarr.json").write_text(json.dumps(header))
-    with pytest.raises(ValueError, match="must have format version 2, got 1: load it with the version of jaxprt that"):
+    with pytest.raises(ValueError, match="must have format version 3, got 1: precompute and save it anew"):
         prt.files.load(tmp_path)
 
 

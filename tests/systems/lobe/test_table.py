@@ -12,6 +12,7 @@ import scipy.stats
 from jaxprt import lobe
 from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert, MetallicRoughness
 from jaxprt.sphere import hemisphere
+from tests.upper import directions, nodes, upper
 
 RESOLUTION = 8
 ENERGY = 2e-3  # The plane of the horizon cuts a wide lobe by a sum over its samples, in float32.
@@ -23,24 +24,6 @@ DIFFERENCE = 2e-2  # Central differences in float32 of what varies over a tenth 
 GLOSSY = CookTorrance(diffuse=0.2, specular=0.5, roughness=0.2)
 COLORED = AshikhminShirley(diffuse=[0.5, 0.2, 0.1], specular=[0.2, 0.4, 0.6], nu=10.0, nv=100.0)
 ROUGHNESS = np.array([0.1, 0.2, 0.4])
-
-
-def directions(*polar):
-    """Unit vectors of (angle to the normal, angle about it)."""
-    theta, phi = np.array(polar).T
-    vector = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
-    return jnp.asarray(vector.astype(np.float32))
-
-
-def upper(seed, count, least=0.0):
-    """Unit vectors at least so high above the horizon."""
-    random = np.random.default_rng(seed)
-    return directions(*np.stack([np.arccos(random.uniform(least, 1, count)), random.uniform(0, 6.28, count)], -1))
-
-
-def nodes(resolution=RESOLUTION):
-    """Views at which an isotropic table is made, but for the one at the horizon."""
-    return directions(*((2 * np.arctan(r), 0.0) for r in np.linspace(0, 1, resolution)[:-1]))
 
 
 @jax.jit
@@ -174,7 +157,7 @@ def test_diffuse_brdfs_have_nearly_no_error_and_the_albedo():
 def test_the_energy_of_each_view_is_the_brdfs(quick, name):
     between = directions((0.1, 0.0), (0.4, 2.0), (0.9, -1.0), (1.2, 4.0))
     brdf = jax.tree_util.Partial(BRDF[name])
-    exact, actual = energies(brdf, quick(name), np.concatenate([nodes(), between]))
+    exact, actual = energies(brdf, quick(name), np.concatenate([nodes(RESOLUTION), between]))
     np.testing.assert_allclose(actual[:-4], exact[:-4], rtol=ENERGY)
     np.testing.assert_allclose(actual[-4:], exact[-4:], rtol=BETWEEN)
 
