@@ -120,6 +120,7 @@ class PoulinFournier(Model):
             plane.
     """
 
+    lobe_width: ClassVar = {"exponent": -2}
     least: ClassVar = {"distance": _GRAZING, "height": -jnp.inf}
 
     diffuse: Float[Array, " c"] = eqx.field(converter=color, default=0.3)
@@ -166,6 +167,7 @@ class PoulinFournierGrooves(Model):
         height: Height of the axes above the plane, in radii: 0 for half cylinders, 1 for a flat plane.
     """
 
+    lobe_width: ClassVar = {"exponent": -2}
     least: ClassVar = {"distance": _GRAZING, "height": -jnp.inf}
 
     diffuse: Float[Array, " c"] = eqx.field(converter=color, default=0.3)

@@ -100,6 +100,7 @@ class GGX(Model):
             that `roughness` is given for.
     """
 
+    lobe_width: ClassVar = {"roughness": 0.5}
     least: ClassVar = {"rotation": -jnp.inf}
 
     f0: Float[Array, " c"] = eqx.field(converter=color, default=0.9)
@@ -125,6 +126,8 @@ class GGXInterface(Model):
 
     Reference: Born and Wolf, "Principles of optics", sections 1.5.2 and 14.2, for Fresnel's equations.
     """
+
+    lobe_width: ClassVar = {"roughness": 0.5}
 
     eta: Float[Array, " c"] = eqx.field(converter=color, default=1.5)
     k: Float[Array, " c"] = eqx.field(converter=color, default=0.0)
@@ -190,6 +193,7 @@ class MetallicRoughness(Model):
     KHR_materials_anisotropy.
     """
 
+    lobe_width: ClassVar = {"roughness": 0.5}
     least: ClassVar = {"rotation": -jnp.inf}
 
     base_color: Float[Array, "*#b #c"] = eqx.field(converter=color, default=1.0)

@@ -18,7 +18,7 @@ Estevez and Kulla 2017, "Production friendly microfacet sheen BRDF", for D and L
 """
 
 import functools
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -73,6 +73,8 @@ class Charlie(Model):
     Attributes:
         roughness: Perceptual roughness of the sheen; alpha is its square. One number, or one for each direction.
     """
+
+    lobe_width: ClassVar = {"roughness": 0.5}
 
     roughness: Float[Array, "*#b"] = eqx.field(converter=scalar, default=0.3)
 

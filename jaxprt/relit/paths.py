@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxprt.brdf import CookTorrance, Lambert
+from jaxprt.brdf import Lambert
 from jaxprt.brdf.microfacet import SchlickDiffuse
 from jaxprt.brdf.varying import Channels
 from jaxprt.relit.channels import Shading
@@ -121,23 +121,16 @@ def still(shading: Shading) -> Callable:
 
 
 def widened(brdf: Callable) -> Callable:
-    """The BRDF with enough roughness for the maps of light paths. A BRDF without a roughness is returned unchanged."""
+    """The BRDF with lobes wide enough for the maps of light paths.
 
-    def wider(path: tuple, leaf: Any) -> Any:
-        name = getattr(path[-1], "name", None) if path else None
-        if name == "roughness":
-            # Cook-Torrance's roughness is the width itself, that of metallic-roughness materials its square root.
-            return jnp.maximum(leaf, _WIDTH if isinstance(_owner(brdf, path), CookTorrance) else _WIDTH**0.5)
-        return jnp.minimum(leaf, 2 / _WIDTH**2 - 2) if name in ("nu", "nv", "exponent") else leaf
-
-    return jax.tree_util.tree_map_with_path(wider, brdf)
+    Models, and BRDFs of users, have a method `widened(width)` that returns them with wider lobes. Others stay as they
+    are.
+    """
+    return jax.tree.map(lambda part: part.widened(_WIDTH) if _widens(part) else part, brdf, is_leaf=_widens)
 
 
-def _owner(tree: Any, path: tuple) -> Any:
-    """The object that holds a leaf of a pytree."""
-    for key in path[:-1]:
-        tree = getattr(tree, key.name) if hasattr(key, "name") else tree[key.idx if hasattr(key, "idx") else key.key]
-    return tree
+def _widens(part: Any) -> bool:
+    return hasattr(part, "widened")
 
 
 def _alone(brdf: Callable) -> separable.SeparableBrdf:

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from jaxprt.brdf import (
+    GGX,
     AshikhminShirley,
     BlinnPhong,
     CookTorrance,
     Lafortune,
     Lambert,
+    MetallicRoughness,
     Phong,
     PoulinFournier,
     PoulinFournierGrooves,
@@ -453,3 +455,23 @@ def test_parameters_that_no_surface_has_are_refused(make, message):
 
 def test_parameters_are_not_looked_at_where_they_are_traced():
     assert jax.grad(lambda albedo: Lambert(albedo).albedo[0])(-1.0) == 1
+
+
+NARROW_AND_WIDE = [
+    (Phong(exponent=1e4), Phong(exponent=198.0)),
+    (BlinnPhong(exponent=1e4), BlinnPhong(exponent=198.0)),
+    (AshikhminShirley(nu=1e4, nv=20.0), AshikhminShirley(nu=198.0, nv=20.0)),
+    (Ward(along=0.02, across=0.3), Ward(along=0.1, across=0.3)),
+    (WardDuer(along=0.3, across=0.02), WardDuer(along=0.3, across=0.1)),
+    (CookTorrance(roughness=0.02), CookTorrance(roughness=0.1)),
+    (GGX(roughness=0.1), GGX(roughness=0.1**0.5)),
+    (MetallicRoughness(roughness=0.1), MetallicRoughness(roughness=0.1**0.5)),
+    (Lambert(0.3), Lambert(0.3)),
+]
+
+
+@pytest.mark.parametrize(("narrow", "wide"), NARROW_AND_WIDE, ids=lambda model: type(model).__name__)
+def test_widened_models_have_lobes_of_that_width_and_wide_ones_stay(narrow, wide):
+    for found in (narrow.widened(0.1), wide.widened(0.1), wide.widened(0.01)):
+        pairs = zip(jax.tree.leaves(found), jax.tree.leaves(wide), strict=True)
+        assert all(np.allclose(a, b, rtol=1e-5) for a, b in pairs)

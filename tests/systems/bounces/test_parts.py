@@ -130,6 +130,25 @@ def test_what_parts_send_to_others_has_the_albedo_of_their_brdf(roughness):
         assert 0.97 < np.sum(sent @ np.asarray(shading.blend.weight[0, :, 0])) < 1.05
 
 
+class Outside(eqx.Module):
+    """GGX by a name of its own."""
+
+    alpha: jax.Array
+
+    def __call__(self, wi, wo):
+        return prt.brdf.GGX(0.9, self.alpha**0.5)(wi, wo)
+
+    def widened(self, width):
+        return Outside(jnp.maximum(self.alpha, width))
+
+
+def test_brdfs_of_users_say_what_they_are_with_wider_lobes():
+    one, other = (np.asarray(paths.widened(Outside(jnp.asarray(alpha))).alpha) for alpha in (0.01, 0.3))
+    np.testing.assert_allclose([one, other], [0.09, 0.3])
+    both = paths.widened(Channels((Outside(jnp.asarray(0.01)), Lambert(0.5)), jnp.ones(2)))
+    np.testing.assert_allclose(both.model[0].alpha, 0.09)
+
+
 def test_what_parts_send_to_others_follows_their_roughness():
     """Albedo of each roughness, and what it makes of the harmonics of light."""
     metal = prt.Part("metal", corner(), TexturedMaterial(0.8, metallic=1.0, roughness=0.4))
