@@ -172,7 +172,7 @@ class BrightTexels(VertexSystem):
         return self.visibility.size
 
     @property
-    def placement(self) -> tuple[Array, Array]:
+    def placement(self) -> tuple[Array | np.ndarray, Array | np.ndarray]:
         """Positions and frames of the vertices."""
         return self.visibility.position, self.visibility.frame
 

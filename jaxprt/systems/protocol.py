@@ -133,7 +133,7 @@ class System(eqx.Module):
         return None
 
     @property
-    def placement(self) -> tuple[Array, Array] | None:
+    def placement(self) -> tuple[Array | np.ndarray, Array | np.ndarray] | None:
         """Positions and frames of the vertices, where the system holds them for the sum over bright texels."""
         return None
 

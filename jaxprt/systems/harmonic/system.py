@@ -8,6 +8,7 @@ Lights, eyes and probes must be finite. Values cannot be checked inside `jax.jit
 in a light or an eye reaches every vertex, and NaN at a probe reaches every vertex with a weight of it.
 """
 
+import math
 from functools import partial
 from typing import Any
 
@@ -179,11 +180,11 @@ def _coefficients(light: Any, degree: int) -> Float[Array, "lm c *w"]:
     """SH coefficients of one light, which may be given as such."""
     if getattr(light, "ndim", 0) not in (2, 3):
         return project(protocol.one_light(light), degree=degree)
-    if not light.shape[0]:
-        raise ValueError(f"the light must have {(degree + 1) ** 2} coefficients, got none")
-    if harmonics.degree_of(light.shape[0]) != degree:
-        got = harmonics.degree_of(light.shape[0])
-        raise ValueError(f"the light must have the transport's degree {degree}, got {got}")
+    rows, edge = light.shape[0], math.isqrt(light.shape[0])
+    if not rows or edge**2 != rows:
+        raise ValueError(f"the light's number of SH coefficients must be a square number, got {rows}")
+    if edge - 1 != degree:
+        raise ValueError(f"the light must have the transport's degree {degree}, got {edge - 1}")
     return _light(light)
 
 
