@@ -10,7 +10,7 @@ same scenes.
 
 import argparse
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -19,101 +19,30 @@ import numpy as np
 from benchmarks import paper_scenes, path_tracing
 from benchmarks.paper_recipes import RECIPES, Look
 from benchmarks.paper_scenes import Made
-from jaxprt import files, image
-from jaxprt.brdf import BlinnPhong, CookTorrance, Lambert
-from jaxprt.image import rasterize, shading_points
+from jaxprt import RelitScene, files, image
+from jaxprt.brdf import Lambert
+from jaxprt.image import raster
+from jaxprt.relit.groups import joined_mesh
 from jaxprt.scene import Camera, Environment
-from jaxprt.scene.points import Points
+from jaxprt.scene.environment import background
 
-CHUNK = 1 << 14  # points that are shaded at once
 SAMPLES = 1024  # of Mitsuba's pixels
 
 
 def picture(
-    made: Made,
-    *,
-    camera: Camera,
-    light: Environment | None = None,
-    materials: Sequence[Any] | None = None,
-    system: Any = None,
+    scene: RelitScene, *, camera: Camera, light: Environment, materials: Mapping[str, Any] | None = None
 ) -> np.ndarray:
-    """A picture of a scene at pixels, anti-aliased, in linear radiance before black, with coverage.
-
-    Args:
-        made: The scene.
-        camera: From where.
-        light: Light of the picture; the light of the recipe if None.
-        materials: Those of all regions; its own if None.
-        system: A part of its system, such as direct light alone; the whole if None.
-    """
-    system = made.system if system is None else system
-    materials = made.materials() if materials is None else materials
-    arrived = system.shade(system.light(paper_scenes.light_of(made) if light is None else light), materials)
-    pixels = shading_points(rasterize(made.mesh, camera, samples=4), made.mesh, camera)
-    triangle = np.asarray(pixels.triangle)
-    face, region = np.asarray(made.mesh.face), np.asarray(made.mesh.region)
-    local, counts = _local(region)
-    owner = np.where(triangle >= 0, region[face[np.maximum(triangle, 0), 0]], -1)
-    own = [np.flatnonzero(owner == number) for number in range(len(counts))]
-    blocks = max(1, -(-sum(map(len, own)) // CHUNK))
-    size = [_rounded(-(-len(each) // blocks)) for each in own]
-    color = np.zeros((len(triangle), 3), np.float32)
-    corner, weight = local[face[np.maximum(triangle, 0)]], np.asarray(pixels.barycentric)
-    for block in range(blocks):
-        rows = [each[block * count : (block + 1) * count] for each, count in zip(own, size, strict=True)]
-        if not any(len(each) for each in rows):
-            break
-        points = [_points(corner, weight, each, count) for each, count in zip(rows, size, strict=True)]
-        placed = system.at(points)
-        radiance = np.asarray(placed.combine(arrived, placed.view(camera.eye, materials)))
-        first = np.cumsum([0, *size[:-1]])
-        for each, start in zip(rows, first, strict=True):
-            color[each] = radiance[start : start + len(each)]
-    return np.asarray(image.resolve(pixels, jnp.asarray(np.pad(color, ((0, 0), (0, 1)), constant_values=1))))
-
-
-def _local(region: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The number of each vertex in its region, and how many these have."""
-    counts = np.bincount(region)
-    local = np.zeros(len(region), np.int32)
-    for number, count in enumerate(counts):
-        local[region == number] = np.arange(count)
-    return local, counts
-
-
-def _rounded(count: int) -> int:
-    """A number of points from few numbers, so that programs serve many pictures."""
-    step = max(1, 1 << max(count - 1, 0).bit_length() >> 3)
-    return max(16, -(-count // step) * step)
-
-
-def _points(corner: np.ndarray, weight: np.ndarray, chosen: np.ndarray, count: int) -> Points:
-    """Some points, and then padding that lies on the region's first vertex."""
-    corners, weights = np.zeros((3, count), np.int32), np.zeros((3, count), np.float32)
-    weights[0] = 1
-    corners[:, : len(chosen)], weights[:, : len(chosen)] = corner[chosen].T, weight[chosen].T
-    return Points(jnp.asarray(corners), jnp.asarray(weights))
-
-
-def direct(made: Made) -> Any:
-    """The system of direct light alone."""
-    return made.system.part[0]
+    """A picture of a scene, anti-aliased, in linear radiance before black, with coverage."""
+    coverage = scene.coverage(camera)[..., None]
+    seen = scene.picture(light, camera, materials=materials)
+    sky = (1 - coverage) * background(light, raster.ray_direction(camera))
+    return np.asarray(jnp.concatenate([seen - sky, coverage], -1))
 
 
 def models(made: Made, changed: Look | None = None) -> list[Any]:
     """BRDFs of all regions, for Mitsuba; `changed` is that of `Made.materials`."""
-    free = {**made.recipe.free, **(changed or {})}
-    result: list[Any] = []
-    for number in range(len(made.system.part[0].brdf)):
-        if number not in free:
-            result.append(Lambert(made.recipe.fixed[number]))
-            continue
-        diffuse, specular, place = free[number]
-        if made.recipe.space == "BP":
-            result.append(BlinnPhong(diffuse, specular, place))
-        else:
-            result.append(CookTorrance(diffuse, specular, place[1], place[0]))
-    return result
+    free = made.materials(changed)
+    return [free.get(part.name) or Lambert(part.material.base_color) for part in made.scene.scene.parts]
 
 
 def traced(
@@ -121,7 +50,7 @@ def traced(
 ) -> np.ndarray:
     """Mitsuba's picture of a scene with so many bounces, with the coverage of ours."""
     found = path_tracing.picture(
-        made.mesh,
+        joined_mesh(made.scene.shading),
         models(made, changed),
         paper_scenes.light_of(made),
         camera,
@@ -129,8 +58,7 @@ def traced(
         samples=samples,
         seed=seed,
     )
-    coverage = image.render(made.mesh, jnp.ones((len(made.mesh.position), 1), jnp.float32), camera)
-    return np.concatenate([found, coverage], -1)
+    return np.concatenate([found, made.scene.coverage(camera)[..., None]], -1)
 
 
 def off(mine: np.ndarray, exact: np.ndarray) -> float:
@@ -159,13 +87,18 @@ class Figures:
         return paper_scenes.camera_of(made, edge=self.edge, **options)
 
     def drawn(
-        self, made: Made, changed: Look | None = None, *, turn: float = 0.0, lit: float = 0.0, system: Any = None
+        self,
+        made: Made,
+        changed: Look | None = None,
+        *,
+        turn: float = 0.0,
+        lit: float = 0.0,
+        scene: RelitScene | None = None,
     ) -> np.ndarray:
-        """A picture with the view or the light turned, other materials, or a part of the light."""
+        """A picture with the view or the light turned, other materials, or without a part of the light."""
         light = paper_scenes.turned(paper_scenes.light_of(made), lit)
-        return picture(
-            made, camera=self.camera(made, turn=turn), light=light, materials=made.materials(changed), system=system
-        )
+        camera, scene = self.camera(made, turn=turn), made.scene if scene is None else scene
+        return picture(scene, camera=camera, light=light, materials=made.materials(changed))
 
     def figure_1(self) -> dict[str, np.ndarray]:
         """A bust whose BRDF moves along a curve in the plane of Fresnel reflectance and roughness."""
@@ -183,13 +116,15 @@ class Figures:
         for edge in (2, 4) if self.quick else (4, 8, 16):
             # The directory of the finest has two bounces; these are one bounce each.
             made = self.scene("ring", edge=edge, bounces=1)
-            found[f"6 x {edge} x {edge}"] = self.drawn(made, system=made.system.part[1])
+            whole, direct = self.drawn(made), self.drawn(made, scene=made.scene.without_bounces())
+            reflected = np.maximum(whole - direct, 0)
+            found[f"6 x {edge} x {edge}"] = np.concatenate([reflected[..., :3], whole[..., 3:]], -1)
         return found
 
     def figure_11(self) -> dict[str, np.ndarray]:
         """Direct light, and interreflection; `traced` has the first picture of the paper's."""
         made = self.scene("bird")
-        return {"direct light": self.drawn(made, system=direct(made)), "two bounces": self.drawn(made)}
+        return {"direct light": self.drawn(made, scene=made.scene.without_bounces()), "two bounces": self.drawn(made)}
 
     def figure_12(self) -> dict[str, np.ndarray]:
         """A room: direct light, with bounces, and after adjusting floor, sofa and walls."""
@@ -198,7 +133,7 @@ class Figures:
         green = {1: ([0.1, 0.45, 0.12], 0.1, 20.0), 0: ([0.5, 0.12, 0.08], 0.2, 60.0)}
         walls = {2: ([0.15, 0.3, 0.6], 0.05, 6.0)}
         return {
-            "direct light": self.drawn(made, system=direct(made)),
+            "direct light": self.drawn(made, scene=made.scene.without_bounces()),
             "two bounces": self.drawn(made),
             "shiny dark floor": self.drawn(made, shiny),
             "red floor, green sofa": self.drawn(made, green),
@@ -227,7 +162,7 @@ class Figures:
         made = self.scene("chess")
         gold = {0: ([0.02, 0.02, 0.02], [1.0, 0.76, 0.33], [0.8, 0.2])}
         return {
-            "direct light": self.drawn(made, system=direct(made)),
+            "direct light": self.drawn(made, scene=made.scene.without_bounces()),
             "two bounces": self.drawn(made),
             "another view": self.drawn(made, turn=0.5),
             "one side of gold": self.drawn(made, gold),

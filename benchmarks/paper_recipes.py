@@ -157,7 +157,6 @@ RECIPES = {
         "grace_cross.hdr",
         ([-0.4, 0.2, 0.75], [0.05, -0.05, -0.05], 0.75),
         VENUS,
-        {"components": 16},
     ),
     "bird": Recipe(
         lambda quick: _grounded(_scan("stanford_bunny.ply", 19_200, quick), quick, 3364),
@@ -185,6 +184,5 @@ RECIPES = {
         "grace_cross.hdr",
         ([0.25, 0.35, 0.95], _ABOVE, 0.6),
         WATCH,
-        {"components": 16},
     ),
 }

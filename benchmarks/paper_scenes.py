@@ -4,7 +4,7 @@
         [--output FILE]
     python -m benchmarks.paper_scenes --table FILE      prints the lines of a file as a table
 
-Scenes have several regions whose materials change while all of them light each other. Room, chess, walls and ring are
+Scenes have several parts whose materials change while all of them light each other. Room, chess, walls and ring are
 made by formula (`benchmarks/published/interiors.py`). The others stand in for the paper's meshes, which are not public:
 scans of JAXPRT_DATA, simplified so that each scene has the paper's number of vertices. Without the data spheres replace
 them.
@@ -31,33 +31,26 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxprt as prt
 from benchmarks import harness
-from benchmarks.interreflection import rms
 from benchmarks.paper_recipes import RECIPES, Look, Published, Recipe
-from jaxprt import bounces, dynamic, separable
-from jaxprt.brdf import Lambert, navigation
+from jaxprt import bounces
+from jaxprt.brdf import BlinnPhong, CookTorrance
 from jaxprt.image import render
-from jaxprt.scene import Camera, Environment, Mesh, builtin, load_environment
+from jaxprt.relit import Dynamic, paths
+from jaxprt.relit.groups import joined_mesh
+from jaxprt.scene import Camera, Environment, TexturedMaterial, builtin, load_environment
 from jaxprt.scene.environment import rotate
-from jaxprt.scene.mesh import bounds
+from jaxprt.scene.mesh import bounds, split
 
 EDGE = 512  # pixels
-LOBES = 6
 KINDS = ("view", "material", "light")  # of frames
-SIZES = {"direct": 32, "edge": 8, "size": 16, "components": 32, "modes": 64, "bounces": 2}
-COOK_TORRANCE = tuple(itertools.product((0.0, 1.0), (0.05, 0.1, 0.2, 0.4, 0.8)))  # F0 and roughness
-BLINN_PHONG = (2.0, 6.0, 20.0, 60.0, 200.0)
-PATHS = {
-    "functions": 3,
-    "terms": 16,
-}  # of sets along light paths, besides the diffuse one; the paper has four functions
-SHARP = (20.0, 200.0)  # exponents where caustics are looked at
-SHARP_TERMS = 40
+SIZE, BOUNCES = 32, 2  # edge of the light's faces for direct light, and number of bounces
 
 
 class Made(NamedTuple):
@@ -66,34 +59,35 @@ class Made(NamedTuple):
     Attributes:
         name: Name of the scene.
         recipe: How it was made.
-        mesh: Mesh of the scene.
-        system: Direct light and bounces.
-        navigation: From coordinates to weights of the set.
+        scene: The scene. Its parts are named by the numbers of their regions.
         seconds: What precomputation took, over all runs.
         peak: The most memory that a process of it had.
     """
 
     name: str
     recipe: Recipe
-    mesh: Mesh
-    system: Any
-    navigation: Any
+    scene: prt.RelitScene
     seconds: float
     peak: int
 
     @property
     def tensor(self) -> bounces.TransferTensor:
         """The tensor of the bounces."""
-        return self.system.part[1].tensor
+        assert self.scene.bounces is not None
+        return self.scene.bounces.tensor
 
-    def materials(self, changed: Look | None = None) -> list[dynamic.Material | None]:
-        """Materials of all regions; `changed` has those of some free regions, as `Recipe.free` has them."""
-        free = {**self.recipe.free, **(changed or {})}
-        return [self._material(*free[number]) if number in free else None for number in range(_regions(self.mesh))]
+    def materials(self, changed: Look | None = None) -> dict[str, Any]:
+        """Materials of the free regions; `changed` has those of some, as `Recipe.free` has them."""
+        looks = {**self.recipe.free, **(changed or {})}
+        return {str(number): model(self.recipe.space, look) for number, look in looks.items()}
 
-    def _material(self, diffuse: Any, specular: Any, coordinate: Any) -> dynamic.Material:
-        colors = (jnp.broadcast_to(jnp.asarray(each, jnp.float32), 3) for each in (diffuse, specular))
-        return dynamic.Material(self.navigation.weight(jnp.asarray(coordinate, jnp.float32)), *colors)
+
+def model(space: str, look: tuple[Any, Any, Any]) -> BlinnPhong | CookTorrance:
+    """The BRDF of a free region."""
+    diffuse, specular, place = look
+    if space == "BP":
+        return BlinnPhong(diffuse, specular, place)
+    return CookTorrance(diffuse, specular, place[1], place[0])
 
 
 def main(options: Sequence[str] | None = None) -> None:
@@ -124,31 +118,48 @@ def prepare(name: str, *, quick: bool = False, store: pathlib.Path | None = None
         options: Options of `bounces.precompute` that replace those of the recipe.
     """
     recipe = RECIPES[name]
-    mesh = recipe.mesh(quick)
-    sharp = "edge" in recipe.options  # finer light than that of the paper's scenes
-    seen, met, family = sets(recipe.space, quick=quick, sharp=sharp)
-    regions: list[Any] = [seen] * _regions(mesh)
-    paths: list[Any] = [met] * len(regions)
-    for number, albedo in recipe.fixed.items():
-        fixed = separable.factor(Lambert(albedo), terms=1, resolution=8)
-        regions[number], paths[number] = fixed, fixed
-    folder = store and store / name
-    given: dict[str, Any] = {**SIZES, **recipe.options, **options}
-    size = given.pop("direct")
-    if quick:
-        size, given = 16, given | {"edge": 4, "size": 8, "components": 8, "modes": 16}
-    marks = "_".join(f"{key}{value}" for key, value in given.items() if key != "bounces")
+    wanted = (
+        {"bounces": BOUNCES, "direct": 16, **options} if quick else {"bounces": BOUNCES, **recipe.options, **options}
+    )
+    count, size, path = wanted.pop("bounces"), wanted.pop("direct", SIZE), store and store / name
+    parts = []
+    for number, mesh in enumerate(split(recipe.mesh(quick))):
+        free = number in recipe.free
+        material = model(recipe.space, recipe.free[number]) if free else matte(recipe.fixed[number])
+        parts.append(prt.Part(str(number), mesh, material))
     start = time.perf_counter()
+    marks = "_".join(f"{key}{value}" for key, value in {"direct": size, **wanted}.items())
     try:
-        path = folder and folder / f"direct{size}"
-        transport = dynamic.precompute_sets(mesh, regions, size=size, path=path, progress=False)
-        tensor = bounces.precompute(mesh, paths, path=folder and folder / marks, progress=False, **given)
+        options = {"refine": False, "size": size, "rays": 0, "progress": False, "path": path and path / f"direct{size}"}
+        system = Dynamic(lobes=4, ranks=None) if quick else Dynamic()
+        scene = prt.precompute(prt.Scene(parts), system=system, bounces=1 if wanted else count, **options)
+        if wanted:
+            scene = with_transfer(scene, path and path / marks, bounces=count, **wanted)
     finally:
-        kept = folder and folder / f"{marks}_bounces{given['bounces']}.json"
-        seconds, peak = _spent(kept, time.perf_counter() - start)
-    direct = dynamic.SetSystem(transport, regions, samples=1 if quick else 2)
-    system = prt.total(direct, bounces.BouncesSystem(tensor, direct))
-    return Made(name, recipe, mesh, system, family.navigation, seconds, peak)
+        seconds, peak = _spent(path and path / f"{marks}_bounces{count}.json", time.perf_counter() - start)
+    return Made(name, recipe, scene, seconds, peak)
+
+
+def rms(value: Any) -> float:
+    """Root mean square."""
+    return float(jnp.sqrt(jnp.mean(jnp.asarray(value) ** 2)))
+
+
+def matte(albedo: Any) -> TexturedMaterial:
+    """The material of a region that does not change."""
+    return TexturedMaterial(base_color=albedo, metallic=0.0, roughness=1.0, specular=0.0)
+
+
+def with_transfer(scene: prt.RelitScene, path: pathlib.Path | None = None, **options: Any) -> prt.RelitScene:
+    """The scene with reflected light that is precomputed with other options, and a region for each part."""
+    assert scene.bounces is not None
+    lights = [paths.factored(scene.shading[parts[0]]) for parts in scene.place.parts]
+    weights = [paths.typical(part, lights[n]) for part, n in zip(scene.shading, scene.place.group, strict=True)]
+    brdfs, mesh = [lights[number].brdf for number in scene.place.group], joined_mesh(scene.shading)
+    tensor = bounces.precompute(mesh, brdfs, weights=weights, path=path, progress=False, **options)
+    vertices = [scene.place.vertices(number) for number in range(len(lights))]
+    made = bounces.GroupBounces.make(tensor, scene.bounces.group, vertices)
+    return eqx.tree_at(lambda relit: relit.bounces, scene, made)
 
 
 def _spent(path: pathlib.Path | None, seconds: float) -> tuple[float, int]:
@@ -166,34 +177,13 @@ def _spent(path: pathlib.Path | None, seconds: float) -> tuple[float, int]:
     return found["seconds"], found["peak"]
 
 
-def sets(space: str, *, quick: bool, sharp: bool) -> tuple[dynamic.BrdfSet, dynamic.BrdfSet, navigation.Family]:
-    """What is seen of a set of BRDFs, by lobes, what light meets on its way, by terms, and the way through the set.
-
-    Usual light paths have 16 terms and views smoothed to degree 5. Sharp ones, for caustics, have a tensor of the
-    BRDFs themselves with more terms, which keeps lobes narrower.
-    """
-    if space == "BP":
-        knots = SHARP if sharp else BLINN_PHONG
-        family = navigation.blinn_phong(exponents=(knots[0], knots[-1]) if quick else knots)
-    else:
-        family = navigation.cook_torrance(
-            point=np.array([each for each in COOK_TORRANCE if not quick or each[1] in (0.05, 0.8)])
-        )
-    seen = dynamic.factor(family.brdf, dynamic.separate(family.brdf, lobes=1 if quick else LOBES))
-    sizes: dict[str, Any] = {"functions": 2, "terms": 4, "resolution": 8} if quick else PATHS
-    if not sharp:
-        return seen, bounces.factor(family.brdf, navigation=family.navigation, **sizes), family
-    ranks = (2, 4, 4) if quick else (len(family.brdf), SHARP_TERMS, SHARP_TERMS)
-    return seen, dynamic.factor(family.brdf, None, ranks=ranks, resolution=8 if quick else 32), family
-
-
 def measure(made: Made, quick: bool) -> Iterator[dict[str, Any]]:
     """Lines of one scene."""
     tensor, row = made.tensor, made.recipe.published
-    direct = prt.memory(made.system.part[0])
+    direct = prt.memory(made.scene.without_bounces())
     common = {
         **{"benchmark": "paper_scenes", "scene": made.name, "space": made.recipe.space},
-        **{"vertices": len(made.mesh.position), "regions": _regions(made.mesh), "adjustable": len(made.recipe.free)},
+        **{"vertices": made.scene.vertices, "regions": len(made.scene.shading), "adjustable": len(made.recipe.free)},
         **{"bytes": tensor.nbytes, "direct_bytes": direct, "error": rms(tensor.error)},
         "worth": [round(float(each), 4) for each in tensor.worth],
     }
@@ -257,7 +247,7 @@ def frames(made: Made, quick: bool) -> Iterator[tuple[str, Callable[[], jax.Arra
     cameras = [camera_of(made, edge=edge, turn=turn) for turn in (0.0, 0.15, 0.3)]
     lights = [turned(light_of(made), turn) for turn in (0.0, 0.7, 1.4)]
     materials = [made.materials(_darker(made, amount)) for amount in (1.0, 0.8, 0.6)]
-    system, count = made.system, itertools.count()
+    system, count = made.scene, itertools.count()
     lit = system.light(lights[0])
     shaded = system.shade(lit, materials[0])
 
@@ -268,7 +258,7 @@ def frames(made: Made, quick: bool) -> Iterator[tuple[str, Callable[[], jax.Arra
         if matter:
             arrived = system.shade(system.light(lights[number]) if light else lit, now)
         color = system.combine(arrived, system.view(cameras[number].eye, now))
-        return render(made.mesh, color, cameras[number], background=None)
+        return render(system.mesh, color, cameras[number], background=None)
 
     changes = ((False, False), (True, False), (True, True))
     for kind, change in zip(KINDS, changes, strict=True):
@@ -283,7 +273,8 @@ def _darker(made: Made, amount: float) -> Look:
 
 def light_of(made: Made) -> Environment:
     """The light of a scene."""
-    size, name = made.system.part[0].transport.size, made.recipe.light
+    name, size = made.recipe.light, made.scene.surfaces[0].system.texel_edge
+    assert size is not None
     path = harness.data() / "env" / name
     return load_environment(path, size=size) if path.is_file() else builtin.daylight(size=size)
 
@@ -297,17 +288,13 @@ def turned(light: Environment, turn: float) -> Environment:
 
 def camera_of(made: Made, *, edge: int = EDGE, turn: float = 0.0) -> Camera:
     """The camera of a scene, turned about the vertical axis through what it looks at."""
-    low, high = bounds(made.mesh)
+    low, high = bounds(made.scene.mesh)
     diagonal, (eye, target, angle) = float(np.linalg.norm(high - low)), made.recipe.camera
     middle = (low + high) / 2 + diagonal * np.asarray(target)
     away = diagonal * (np.asarray(eye) - np.asarray(target))
     cosine, sine = np.cos(turn), np.sin(turn)
     away = away @ np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]])
     return Camera(middle + away, middle, [0.0, 1.0, 0.0], angle, edge, edge)
-
-
-def _regions(mesh: Mesh) -> int:
-    return int(np.max(np.asarray(mesh.region))) + 1
 
 
 if __name__ == "__main__":

@@ -27,25 +27,6 @@ def test_seconds_of_runs_add_up_until_all_is_there(tmp_path):
     assert paper_scenes._spent(path, 100.0) == (done, peak)
 
 
-def test_points_are_numbered_in_their_region_and_padded_on_its_first_vertex():
-    region = np.array([1, 0, 1, 1, 0])
-    local, counts = paper_figures._local(region)
-    np.testing.assert_array_equal(local, [0, 0, 1, 2, 1])
-    np.testing.assert_array_equal(counts, [2, 3])
-    corner, weight = local[np.array([[0, 2, 3], [3, 0, 2]])], np.array([[0.2, 0.3, 0.5], [0.6, 0.3, 0.1]])
-    points = paper_figures._points(corner, weight, np.array([1]), 3)
-    points.check(3)
-    np.testing.assert_array_equal(points.corner, np.array([[2, 0, 1], [0, 0, 0], [0, 0, 0]]).T)
-    np.testing.assert_allclose(points.weight, np.array([[0.6, 0.3, 0.1], [1, 0, 0], [1, 0, 0]]).T, rtol=1e-6)
-
-
-def test_few_numbers_of_points_serve_all():
-    sizes = [paper_figures._rounded(count) for count in range(1, 5000)]
-    assert all(size >= count for count, size in enumerate(sizes, 1))
-    assert max(size / count for count, size in enumerate(sizes, 1) if count > 64) <= 1.26
-    assert len(set(sizes)) < 60
-
-
 def test_the_background_does_not_count_in_what_a_picture_is_off():
     exact = np.zeros((4, 4, 4))
     exact[1:3] = [0.5, 0.5, 0.5, 1]
