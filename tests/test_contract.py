@@ -518,6 +518,7 @@ EXAMPLES = {
     "sphere.cubemap.unproject": example(lambda draw: call(draw.integer(6, 7), draw.normal(7), draw.normal(7))),
     "sphere.cubemap.project": example(lambda draw: call(draw.normal(7), draw.normal(7), draw.normal(7))),
     "sphere.cubemap.pad": example(lambda draw: call(draw.normal(6, 3, 3, 2))),
+    "sphere.cubemap.reduced": example(lambda draw: call(draw.normal(6, 4, 4, 2)), size=2),
     "sphere.cubemap.lookup": example(lambda draw: call(draw.normal(6, 3, 3, 2), draw.unit(7)), sharpness=2),
     "sphere.hemisphere.disk_coordinates": example(lambda draw: call(draw.upper(5))),
     "benchmarks.published.maps.disk_direction": example(lambda draw: call(draw.uniform(5, 2, low=0.2, high=0.8))),

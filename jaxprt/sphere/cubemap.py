@@ -252,6 +252,26 @@ def pad(cubemap: Float[Array, "6 n n *c"]) -> Float[Array, "6 m m *c"]:
     return texel[index].at[:, outer[:, None], outer].set(corner, unique_indices=True)
 
 
+@functools.partial(jit, static_argnames="size")
+def reduced(cubemap: Float[Array, "6 n n c"], *, size: int) -> Float[Array, "6 m m c"]:
+    """A cubemap at lower resolution: means over groups of texels, weighted by their solid angles.
+
+    Args:
+        cubemap: Values at texels.
+        size: Edge of the faces of the result in texels, a divisor of n.
+
+    Raises:
+        ValueError: `size` is not a divisor of n.
+    """
+    large = cubemap.shape[1]
+    if size < 1 or large % size:
+        raise ValueError(f"size must be a divisor of {large}, got {size}")
+    area = solid_angle(size=large)[..., None].astype(cubemap.dtype)
+    folded = (6, size, large // size, size, large // size, -1)
+    value, whole = (values.reshape(folded).sum((2, 4)) for values in (cubemap * area, area))
+    return value / whole
+
+
 def _check(size: int) -> None:
     if size < 1:
         raise ValueError(f"size must be at least 1, got {size}")

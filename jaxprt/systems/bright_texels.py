@@ -176,6 +176,15 @@ class BrightTexels(VertexSystem):
         """Positions and frames of the vertices."""
         return self.visibility.position, self.visibility.frame
 
+    @property
+    def texel_visibility(self) -> Any:
+        """The visibility of single texels."""
+        return self.visibility
+
+    def exported(self, what: str) -> protocol.Exported:
+        """That of the underlying system."""
+        return self.system.exported(what)
+
     def with_samples(self, samples: int) -> "BrightTexels":
         """The system with another number of sample points along the edge of each bright texel."""
         return self if samples == self.samples else dataclasses.replace(self, samples=samples)

@@ -8,20 +8,23 @@ radiance = system.combine(A, V)        one row per vertex, in the order of the m
 
 import abc
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, PyTree, UInt8
 
 from jaxprt import require
 from jaxprt.compile import promoted
 from jaxprt.scene import origin as origins
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
+
+CHANNELS = 4  # most channels of a BRDF's table that exported pages hold
+_KNOTS = 64  # most knots of its parameter
 
 
 class System(eqx.Module):
@@ -137,14 +140,133 @@ class System(eqx.Module):
         """Positions and frames of the vertices, where the system holds them for the sum over bright texels."""
         return None
 
+    @property
+    def texel_visibility(self) -> Any:
+        """Visibility of the single texels whose light is summed exactly, as `BrightTexels` has it; None without."""
+        return None
+
     def with_samples(self, samples: int) -> "System":
         """The system with another number of sample points along the edge of each bright texel."""
         return self
+
+    def exported(self, what: str) -> "Exported":
+        """What an exported page holds of the system. Systems without a form of their own can return another system's.
+
+        Args:
+            what: What error messages call the system, such as "part 'ball'".
+
+        Raises:
+            ValueError: A page cannot show the system. By default it can show none.
+        """
+        raise ValueError(
+            f"{what} must be ideally diffuse or made by the system 'lobe', 'dynamic' or 'harmonic' to be exported, got "
+            f"{type(self).__name__}, which has no method `exported`"
+        )
 
     @property
     def growing(self) -> PyTree:
         """What has a row for each vertex, to estimate bytes."""
         return getattr(self, "transport", self)
+
+
+class Exported(eqx.Module):
+    """What an exported page holds of a system: transport that is stored as bytes, and the table of its BRDF.
+
+    By default surfaces are ideally diffuse, and lit by transfer vectors. Subclasses have transfer matrices, and lobes.
+
+    Attributes:
+        system: The system whose transport and BRDF these are.
+        vector: Transfer vectors in spherical harmonics; no rows where the page makes transfer matrices.
+        visible: Harmonics of the visibility, of twice the degree of the transfer matrices; no rows without matrices.
+    """
+
+    system: Any
+    vector: Float[np.ndarray, "lm v"]
+    visible: Float[np.ndarray, "k v"]
+
+    @property
+    def brdf(self) -> Any:
+        """The BRDF in the form of the system; None for ideally diffuse surfaces. Equal ones share a table."""
+        return None
+
+    @property
+    def channels(self) -> int:
+        """Number of channels of the table."""
+        return 1
+
+    @property
+    def weight(self) -> Float[np.ndarray, "k c"]:
+        """Weights of the channels of a fixed BRDF: the albedo, or each channel as a color, white for one."""
+        if self.brdf is None:
+            return np.asarray(self.system.albedo)[None]
+        return np.eye(self.channels) if self.channels > 1 else np.ones((1, 3))
+
+    @property
+    def degree(self) -> int | None:
+        """Degree of the transfer matrices; None without."""
+        return None
+
+    @property
+    def light_size(self) -> int:
+        """Edge of the faces of the light that lobes read, in texels; 0 without lobes."""
+        return 0
+
+    @property
+    def scales(self) -> Any:
+        """Scales of the visibility that lobes read, as `jaxprt.systems.lobe.pyramid.Scales`; None without lobes."""
+        return None
+
+    @property
+    def means(self) -> UInt8[np.ndarray, "v n"]:
+        """Mean visibility of the scales that the page holds."""
+        return np.zeros((0, 0), np.uint8)
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """Numbers by which the page's module reads the arrays."""
+        varies = self.brdf is not None and self.brdf.knot
+        knot = np.asarray(self.brdf.knot[0], float).tolist() if varies else []
+        return {"lobes": 0, "bands": 0, "words": 0, "steps": 0.0, "knot": knot, "laplacian": 1.0}
+
+    def table(self, what: str) -> Float[np.ndarray, "h q e 4"]:
+        """Entries of the BRDF for each knot and view node. `what` names the system in messages.
+
+        Raises:
+            ValueError: The page cannot represent the BRDF.
+        """
+        return np.ones((1, 1, 1, 4))
+
+    def check_table(self, what: str) -> None:
+        """Refuses tables that a page cannot hold.
+
+        Raises:
+            ValueError: The table is anisotropic, or has too many channels, parameters or knots.
+        """
+        knots = [len(knot) for knot in self.brdf.knot]
+        if not self.brdf.isotropic:
+            raise ValueError(f"{what} must have an isotropic BRDF to be exported, got an anisotropic one")
+        if self.channels > CHANNELS or len(knots) > 1 or any(count > _KNOTS for count in knots):
+            raise ValueError(
+                f"{what} must have a table of at most {CHANNELS} channels and one parameter of {_KNOTS} knots to be "
+                f"exported, got {self.channels} and {knots}"
+            )
+
+    def texel_brdf(self, brdf: Callable) -> Callable:
+        """The BRDF by which the page sums single texels, where no blend weights it; `brdf` is that of the part."""
+        return brdf
+
+    def with_table(self, table: Any) -> "Exported":
+        """The same transport with the BRDF of a `StandardTable`, in place of that under a clear coat or a sheen."""
+        return self
+
+    def reduced(self, level: int, degree: int | None) -> "Exported":
+        """The same at lower resolution: from a scale of the visibility on, and matrices up to a degree."""
+        return self
+
+    def relit(self) -> System:
+        """The system that computes what the page does, from `vector` and `visible` as they are."""
+        vector = jnp.asarray(self.vector, jnp.result_type(float))[:, None]
+        return eqx.tree_at(lambda system: system.transport.vector, self.system, vector)
 
 
 class VertexSystem(System):

@@ -4,7 +4,6 @@ import base64
 import html
 import itertools
 import json
-import math
 import os
 import pathlib
 import struct
@@ -23,28 +22,15 @@ from jaxprt.brdf.varying import Channels
 from jaxprt.files import outputs
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.scene import RelitScene
-from jaxprt.scene import Environment, Mesh, TexturedMaterial
+from jaxprt.scene import Environment, Mesh, TexturedMaterial, material_table
 from jaxprt.scene.material import Texture
 from jaxprt.sphere import cubemap
-from jaxprt.systems import harmonic, lobe, standard
-from jaxprt.systems.lobe import blurred_light, pyramid
-from jaxprt.view import messages, reduced, stages
+from jaxprt.systems import standard
+from jaxprt.systems.lobe import blurred_light
+from jaxprt.systems.protocol import Exported
+from jaxprt.view import messages, stages
 from jaxprt.view.messages import Reply
-from jaxprt.view.reduced import (
-    Exported,
-    bits_of,
-    coarse,
-    edge_of,
-    light_size,
-    resize,
-    scale_of,
-    systems_of,
-    texels_of,
-    vector_unit,
-    vectors_of,
-    visibility_of,
-    without_layers,
-)
+from jaxprt.view.reduced import PageScene, texels_of, unit_of
 from jaxprt.view.server import MODULE
 from jaxprt.view.session import Session
 from jaxprt.view.stages import counterclockwise
@@ -81,50 +67,53 @@ _FLOAT, _UINT = 5126, 5125
 _ARRAY, _ELEMENT = 34962, 34963
 
 
-def scene_content(reduced: RelitScene, level: int) -> tuple[dict[str, Any], list[bytes]]:
+def scene_content(page: PageScene) -> tuple[dict[str, Any], list[bytes]]:
     """JSON description and arrays of all parts. `Piece` in the page's module defines their order."""
-    systems, bits = systems_of(reduced), bits_of(reduced)
-    vectors, visible = [vectors_of(exported) for exported in systems], visibility_of(reduced)
-    unit, visible_unit = vector_unit(vectors), vector_unit(visible)
+    bits = page.bits or [np.zeros((0, 0), np.uint8)] * len(page.parts)
+    unit, visible_unit = unit_of([held.vector for held in page.parts]), unit_of([held.visible for held in page.parts])
     terms = max(-(-len(unit) // 4) * 4, 4)
     place: dict[str, int] = dict.fromkeys(_STARTS, 0)
-    tables, tilted = _Tables(), reduced.table.at_vertices().normal
+    tables, normals = _Tables(), _normals(page)
     parts, stride = [], 0
     arrays: list[list[np.ndarray]] = [[] for _ in range(6)]
-    for number, (part, system, vector) in enumerate(zip(reduced.scene.parts, systems, vectors, strict=True)):
-        shading, (start, table) = reduced.shading[number], tables.add(part.name, system)
-        weight, seen, described = (
-            _weights(shading, system),
-            _means(system, level),
-            _material_json(part.material, shading),
-        )
-        words = None if bits is None else bits[number]
-        bit = np.zeros((0, 0), np.uint8) if words is None else words
-        about = _system_json(system) | {"family": _family(shading), "texels": bool(bit.size)}
-        about |= {"name": part.name, "count": vector.shape[1], "channels": weight.shape[1] - 1}
-        about |= {"nodes": table.shape[1], "entries": table.shape[2], "terms": -(-len(vector) // 4) * 4}
+    rows = zip(page.scene.parts, page.shading, page.parts, bits, normals, strict=True)
+    for part, shading, held, bit, direction in rows:
+        start, table = tables.add(f"part {part.name!r}", held)
+        weight, seen, described = _weights(shading, held), held.means, _material_json(part.material, shading)
+        count = held.vector.shape[1]
+        about = held.description | {"family": _family(shading), "texels": bool(bit.size)}
+        about |= {"name": part.name, "count": count, "channels": weight.shape[1] - 1}
+        about |= {"nodes": table.shape[1], "entries": table.shape[2], "terms": -(-len(held.vector) // 4) * 4}
         about |= {"weightStep": 0 if described else weight.shape[1], **(described or {})}
         parts.append(about | place | {"tableStart": start})
         weight = weight[:1] if described else weight
         stride = max(stride, seen.shape[1])
-        rows = _bytes(vector, unit, terms), _bytes(visible[number], visible_unit, 4 * about["words"])
-        first = int(reduced.place.first[number])
-        direction = shading.mesh.normal if tilted is None else tilted[first : first + len(shading.mesh.normal)]
+        vector = _bytes(held.vector, unit, terms)
+        visible = _bytes(held.visible, visible_unit, 4 * about["words"])
         normal = np.round(32767 * np.asarray(direction))
         kinds = "<i2", "i1", "u1", "<f4", "i1", "u1"
-        for column, array, kind in zip(arrays, (normal, rows[0], seen, weight, rows[1], bit), kinds, strict=True):
+        for column, array, kind in zip(arrays, (normal, vector, seen, weight, visible, bit), kinds, strict=True):
             column.append(array.astype(kind).reshape(-1))
-        pairs = len(vector.T) * -(-(about["bands"] ** 2) // 2)
-        sizes = vector.shape[1], weight.size // 4, seen.size, rows[1].size // 4, pairs, bit.size
+        pairs = count * -(-(about["bands"] ** 2) // 2)
+        sizes = count, weight.size // 4, seen.size, visible.size // 4, pairs, bit.size
         place = {name: start + size for (name, start), size in zip(place.items(), sizes, strict=True)}
-    content = {"parts": parts, "terms": terms, "vectorUnit": unit.tolist(), "stride": stride, **_scales(reduced, level)}
+    content = {"parts": parts, "terms": terms, "vectorUnit": unit.tolist(), "stride": stride, **_scales(page)}
     content |= {"visibleUnit": visible_unit.tolist(), "arrived": place["arrivedStart"]}
-    edge = 0 if bits is None else math.isqrt(8 * next(words.shape[1] for words in bits if words is not None) // 6)
+    edge = page.texel_edge
     content |= {"texelEdge": edge, "texels": texels_of(edge) if edge else 0}
     joined = [np.concatenate(column) for column in arrays]
     joined.insert(3, tables.joined())
     joined[2] = np.append(joined[2], np.zeros(4 - len(joined[2]) % 4, np.uint8))  # whole words
     return content, [array.tobytes() for array in joined]
+
+
+def _normals(page: PageScene) -> list[Float[np.ndarray, "v 3"]]:
+    """Normals at the vertices of each part, with those of normal maps."""
+    tilted = material_table.of_parts(page.scene.parts).at_vertices().normal
+    if tilted is None:
+        return [np.asarray(shading.mesh.normal) for shading in page.shading]
+    counts = [len(shading.mesh.normal) for shading in page.shading]
+    return np.split(np.asarray(tilted), np.cumsum(counts)[:-1])
 
 
 class _Tables:
@@ -135,11 +124,12 @@ class _Tables:
         self._made: dict[Any, tuple[int, Float[np.ndarray, "h q e 4"]]] = {}
         self._end = 0
 
-    def add(self, name: str, system: Exported) -> tuple[int, Float[np.ndarray, "h q e 4"]]:
-        """The table of a part's system, and where its texels start among those of all tables."""
-        key = _key(system)
+    def add(self, what: str, held: Exported) -> tuple[int, Float[np.ndarray, "h q e 4"]]:
+        """The table of a part, which messages call `what`, and where its texels start among those of all tables."""
+        leaves, kind = jax.tree.flatten(held.brdf)
+        key = kind, *((np.shape(leaf), np.asarray(leaf).tobytes()) for leaf in leaves)
         if key not in self._made:
-            table = _table(name, system)
+            table = held.table(what)
             self._made[key] = self._end, table
             self._end += table.size // 4
         return self._made[key]
@@ -149,33 +139,6 @@ class _Tables:
         return np.concatenate([table.astype("<f4").reshape(-1) for _, table in self._made.values()])
 
 
-def _key(system: Exported) -> Any:
-    """Equal for systems with equal tables."""
-    if isinstance(system, harmonic.DiffuseSystem):
-        return None
-    leaves, kind = jax.tree.flatten(system.brdf)
-    return kind, *((np.shape(leaf), np.asarray(leaf).tobytes()) for leaf in leaves)
-
-
-def _system_json(system: Exported) -> dict[str, Any]:
-    """JSON description of a part's system for the page's module."""
-    about = {"lobes": 0, "bands": 0, "words": 0, "steps": 0.0, "knot": [], "laplacian": 1.0}
-    if isinstance(system, lobe.LobeSystem):
-        return about | {"lobes": system.brdf.lobes, "steps": float(system.brdf.weight.shape[-1] - 1), **_knot(system)}
-    if isinstance(system, harmonic.HarmonicSystem):
-        fields = {
-            "bands": system.degree + 1,
-            "words": reduced.matrix_words(system),
-            "laplacian": float(system.laplacian),
-        }
-        return about | fields | {"steps": system.brdf.steps, **_knot(system)}
-    return about
-
-
-def _knot(system: lobe.LobeSystem | harmonic.HarmonicSystem) -> dict[str, list[float]]:
-    return {"knot": np.asarray(system.brdf.knot[0], float).tolist() if system.brdf.knot else []}
-
-
 def _bytes(value: Float[np.ndarray, "k v"], unit: Float[np.ndarray, " m"], length: int) -> Float[np.ndarray, "v l"]:
     """Values quantized to integer multiples of the units, in rows of a given length."""
     padded = np.zeros((value.shape[1], length))
@@ -183,9 +146,9 @@ def _bytes(value: Float[np.ndarray, "k v"], unit: Float[np.ndarray, " m"], lengt
     return padded
 
 
-def _scales(reduced: RelitScene, level: int) -> dict[str, Any]:
+def _scales(page: PageScene) -> dict[str, Any]:
     """The scales of visibility that the page keeps."""
-    scale = scale_of(reduced)
+    scale, level = page.scales, page.level
     if scale is None:
         return NO_SCALES
     starts = scale.start[level:] - scale.start[level]
@@ -226,46 +189,11 @@ def _family(shading: Shading) -> dict[str, list]:
     return {"terms": terms, "scale": np.asarray(shading.scale, float).tolist()}
 
 
-def _means(system: Exported, level: int) -> np.ndarray:
-    if not isinstance(system, lobe.LobeSystem):
-        return np.zeros((0, 0), np.uint8)
-    transport = system.transport
-    return np.ascontiguousarray(np.asarray(transport.pyramid)[:, pyramid.scales(edge_of(transport)).start[level] :])
-
-
-def _table(name: str, system: Exported) -> Float[np.ndarray, "h q e 4"]:
-    """Table of a part's BRDF. Parts with transfer matrices use `jaxprt.view.reduced.plane_table`.
-
-    For lobes it holds, for each knot and view node, the mean, log concentration and weights of each lobe, and albedos.
-    """
-    if isinstance(system, harmonic.HarmonicSystem):
-        return reduced.plane_table(name, system.brdf)
-    if not isinstance(system, lobe.LobeSystem):
-        return np.ones((1, 1, 1, 4))
-    brdf = system.brdf
-    mean, scale, weight, albedo = (np.asarray(array) for array in (brdf.mean, brdf.scale, brdf.weight, brdf.diffuse))
-    if not brdf.knot:
-        mean, scale, weight, albedo = mean[:, :, None], scale[:, None], weight[:, :, None], albedo[:, None]
-    lobes, knots, nodes = scale.shape
-    result = np.zeros((knots, nodes, 2 * lobes + 1, 4))
-    result[:, :, 0:-1:2, :3] = mean.transpose(2, 3, 1, 0)
-    result[:, :, 0:-1:2, 3] = scale.transpose(1, 2, 0)
-    result[:, :, 1::2, : len(weight)] = weight.transpose(2, 3, 1, 0)
-    result[:, :, -1, : len(albedo)] = albedo.transpose(1, 2, 0)
-    return result
-
-
-def _weights(shading: Shading, system: Exported) -> Float[np.ndarray, "v k 4"]:
+def _weights(shading: Shading, held: Exported) -> Float[np.ndarray, "v k 4"]:
     """Channel weights at each vertex, followed by its emission. The first row also holds the logarithm of roughness."""
     count = len(shading.mesh.position)
-    if shading.blend is not None:
-        weight = np.asarray(shading.blend.weight)
-    elif isinstance(system, harmonic.DiffuseSystem):
-        weight = np.broadcast_to(np.asarray(system.albedo), (count, 1, len(system.albedo)))
-    else:
-        brdf = system.brdf
-        channels = len(brdf.weight) if isinstance(brdf, lobe.LobeBrdf) else brdf.table.shape[1]
-        weight = np.broadcast_to(np.eye(channels) if channels > 1 else np.ones((1, 3)), (count, channels, 3))
+    weight = held.weight if shading.blend is None else np.asarray(shading.blend.weight)
+    weight = np.broadcast_to(weight, (count, *weight.shape[-2:]))
     result = np.zeros((count, weight.shape[1] + 1, 4))
     result[:, :-1, :3] = weight
     if shading.blend is not None and shading.blend.parameter:
@@ -462,18 +390,18 @@ def export(
     scene = scene.centered()
     session = Session(scene, environments=environments)
     lights = dict(zip(session.stages.name, session.stages.lights, strict=True))
-    bare = without_layers(scene)
-    bits = bits_of(bare)
+    whole = PageScene.of(scene)
     # Sharp shadows of a small sun matter more than finely averaged visibility.
-    fits = bits is not None and sum(words.size for words in bits if words is not None) <= _MOST_BITS
+    fits = whole.bits is not None and sum(words.size for words in whole.bits) <= _MOST_BITS
     least = 0
-    for texels, size in itertools.product([True, False] if fits else [False], _sizes(bare)):
-        reduced = coarse(bare, size.level, texels=texels, degree=size.degree)
-        contents = scene_content(reduced, size.level)
+    for texels, size in itertools.product([True, False] if fits else [False], _sizes(whole)):
+        reduced = whole.reduced(size.level, texels=texels, degree=size.degree)
+        contents = scene_content(reduced)
         least = len(_page(session, reduced, lights, contents, error=0.0, title=path.stem))
         if least > most + _SPARE:
             continue
-        error = max(_error(scene, reduced, light) for light in lights.values())
+        relit = reduced.relit()
+        error = max(_error(scene, relit, light) for light in lights.values())
         page = _page(session, reduced, lights, contents, error=error, title=path.stem)
         least = len(page)
         if least <= most:
@@ -496,18 +424,20 @@ class _Size(NamedTuple):
     degree: int | None
 
 
-def _sizes(scene: RelitScene) -> list[_Size]:
+def _sizes(page: PageScene) -> list[_Size]:
     """Resolutions from the finest to the coarsest. The data that takes more bytes is reduced first."""
-    systems, scale = systems_of(scene), scale_of(scene)
-    lobes = sum(system.vertices for system in systems if isinstance(system, lobe.LobeSystem))
-    matrix = [system for system in systems if isinstance(system, harmonic.HarmonicSystem)]
-    degree = max((system.degree for system in matrix), default=None)
+    scale, counts = page.scales, [held.vector.shape[1] for held in page.parts]
+    lobes = sum(count for count, held in zip(counts, page.parts, strict=True) if held.scales is not None)
+    matrices = [(count, held.degree) for count, held in zip(counts, page.parts, strict=True) if held.degree is not None]
+    degree = max((most for _, most in matrices), default=None)
     level = 0 if scale is None else _FIRST
     result = []
     while True:
         result.append(_Size(level, 0 if scale is None else int(scale.edge[level]), degree))
         means = 0 if scale is None or level == len(scale.edge) - 1 else lobes * int(scale.total - scale.start[level])
-        bands = 0 if degree is None or degree <= 1 else sum(reduced.matrix_bytes(system, degree) for system in matrix)
+        bands = 0
+        if degree is not None and degree > 1:
+            bands = sum(count * (2 * min(most, degree) + 1) ** 2 for count, most in matrices)
         if not means and not bands:
             return result
         if means >= bands:
@@ -532,7 +462,7 @@ def _error(scene: RelitScene, reduced: RelitScene, light: Environment) -> float:
 
 def _page(
     session: Session,
-    reduced: RelitScene,
+    reduced: PageScene,
     lights: Mapping[str, Environment],
     contents: tuple[dict[str, Any], list[bytes]],
     skies: Sequence[Reply | None] = (),
@@ -544,7 +474,7 @@ def _page(
     reply = session.answer({"kind": "scene"})
     content, arrays = contents
     mips = mip_edges(next(iter(lights.values())).radiance.shape[-2])
-    size = light_size(reduced)
+    size = reduced.light_size
     blurring = blur_parameters(size) if size else NO_SCALES
     free = [
         part | {"free": _free_parameters(part["free"]) if "material" in entry else None}
@@ -608,5 +538,5 @@ def _free_parameters(free: dict[str, Any]) -> dict[str, Any]:
 
 
 def _light_texels(light: Environment, size: int) -> Float[np.ndarray, "6 n n 3"]:
-    radiance = np.asarray(resize(light, size=size).radiance)
+    radiance = np.asarray(cubemap.reduced(light.radiance, size=size))
     return np.broadcast_to(radiance, (*radiance.shape[:-1], 3))

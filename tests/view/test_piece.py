@@ -17,7 +17,7 @@ from jaxprt.scene import Environment, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
 from jaxprt.view import messages, stages
 from jaxprt.view.piece import scene_content
-from jaxprt.view.reduced import coarse
+from jaxprt.view.reduced import PageScene
 
 SHOWN = 'mount(document.getElementById("viewer"), answers(content, buffers));'
 ASKED = """async (message) => {
@@ -76,7 +76,7 @@ LAMPS = [{"direction": [0.2, 1.0, 0.5], "angle": 0.4, "radiance": [5.0, 4.0, 3.0
 def reduced_radiance(scene, lights, message, **sizes):
     """What Python makes of a scene that has been reduced as a page has it."""
     known = messages.look(message, systems=["lobes"], lights=2)
-    made = stages.Stages({"lobes": coarse(scene, 2, **sizes)}, lights)
+    made = stages.Stages({"lobes": PageScene.of(scene).reduced(2, **sizes).relit()}, lights)
     light = made.unturned(known.light, known.lamps)
     if known.turn:
         light = rotate(light, stages.about(known.turn))
@@ -163,7 +163,7 @@ def test_lobes_and_matrices_share_a_page_and_exponents_change(browser, mixed, li
 
 
 def test_error_is_told_against_the_whole_scene(made, systems, lights):
-    scene, reduced = systems["lobes"], coarse(systems["lobes"], 2, texels=True)
+    scene, reduced = systems["lobes"], PageScene.of(systems["lobes"]).reduced(2, texels=True).relit()
     apart = norm = 0.0
     for quarter in range(4):
         turn = stages.about(quarter * np.pi / 2)
@@ -205,7 +205,7 @@ def test_dropped_hdr_lights_the_page_as_it_lights_python(coding, page, systems, 
     assert content["lights"][-1] == "soft"
     found = page.color(look | {"light": content["light"]})
     light = prt.load_environment(path, size=8)
-    true = coarse(systems["lobes"], 2, texels=True).radiance(light, eye=jnp.asarray(look["eye"]))
+    true = PageScene.of(systems["lobes"]).reduced(2, texels=True).relit().radiance(light, eye=jnp.asarray(look["eye"]))
     assert off(found, np.asarray(true)) < 0.02
 
 
@@ -253,7 +253,7 @@ def test_parts_with_one_kind_of_material_share_a_table(recipe):
     pairs = zip(meshes, materials.items(), strict=True)
     scene = Scene([Part(name, mesh, material) for mesh, (name, material) in pairs])
     made = prt.precompute(scene, refine=False, system=recipe, size=8, progress=False)
-    content, arrays = scene_content(coarse(made, 2, texels=False), 2)
+    content, arrays = scene_content(PageScene.of(made).reduced(2, texels=False))
     first, shiny, second, matte = content["parts"]
     assert first["tableStart"] == second["tableStart"] == 0
     sizes = [part["entries"] * part["nodes"] * max(len(part["knot"]), 1) for part in (first, shiny, matte)]

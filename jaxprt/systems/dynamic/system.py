@@ -121,6 +121,10 @@ class DynamicSystem(protocol.VertexSystem):
         """The lobes and the diffuse part alone, without the tensor: what exported pages show."""
         return LobeSystem(self.transport.pyramid, self.brdf.lobe, points=self.points)
 
+    def exported(self, what: str) -> protocol.Exported:
+        """That of the lobes, without the tensor."""
+        return self.lobes.exported(what)
+
     @property
     def vertices(self) -> int:
         """Number of vertices, or of points where radiance is evaluated at points."""

@@ -14,6 +14,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxprt import require
@@ -22,6 +23,7 @@ from jaxprt.compile import jit, promoted
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import directions, harmonics, rotation
 from jaxprt.systems import protocol
+from jaxprt.systems.harmonic.exported import ExportedMatrices
 from jaxprt.systems.harmonic.table import HarmonicBrdf
 from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector, right_handed
 from jaxprt.systems.protocol import Blend
@@ -119,6 +121,10 @@ class HarmonicSystem(protocol.VertexSystem):
         require.array("the view", view, "lm c v", source="HarmonicSystem.view")
         return combine(self.carried(light, axis=2), view)
 
+    def exported(self, what: str) -> ExportedMatrices:
+        """Harmonics of the visibility, from which a page makes the matrices: `System.exported`."""
+        return ExportedMatrices.of(what, self)
+
     @property
     def vertices(self) -> int:
         """Number of vertices, or of points where radiance is evaluated at points."""
@@ -159,6 +165,13 @@ class DiffuseSystem(protocol.VertexSystem):
         require.array("the light", light, "lm c", "lm c v", source="DiffuseSystem.light")
         require.array("the view", view, "v c", source="DiffuseSystem.view")
         return self.carried(combine(light, self.transport.vector)) * view
+
+    def exported(self, what: str) -> protocol.Exported:
+        """The transfer vectors: `System.exported`."""
+        vector = self.transport.vector
+        if vector.shape[1] != 1:
+            raise ValueError(f"{what} must have gray transfer vectors to be exported, got {vector.shape[1]} colors")
+        return protocol.Exported(self, np.asarray(vector[:, 0], np.float64), np.zeros((0, self.vertices)))
 
     @property
     def matte(self) -> bool:

@@ -63,6 +63,11 @@ class LobeTransport(eqx.Module):
         """Bytes of pyramids and vectors."""
         return self.pyramid.nbytes + self.vector.nbytes
 
+    @property
+    def packed(self) -> UInt8[np.ndarray, "v n"]:
+        """The bits of the texels of each vertex."""
+        return np.asarray(self.pyramid)[:, : 6 * self.size**2 // 8]
+
     def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t v"]:
         """1 where a vertex sees at least half of a texel, 0 elsewhere; one row for each of the given texels."""
         byte, bit = _bit(*_split(texel, self.size), self.size)
@@ -394,6 +399,11 @@ class TexelBits(eqx.Module):
         """Bytes of the bits."""
         return self.bit.nbytes
 
+    @property
+    def packed(self) -> UInt8[np.ndarray, "v n"]:
+        """The bits of the texels of each vertex."""
+        return np.asarray(self.bit).T
+
     def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t v"]:
         """1 where a vertex sees at least half of a texel, 0 elsewhere; one row for each of the given texels."""
         byte, bit = _bit(*_split(texel, self.size), self.size)
@@ -403,8 +413,7 @@ class TexelBits(eqx.Module):
 
 def texel_bits(transport: LobeTransport) -> TexelBits:
     """The bits of a transport, transposed so that those of one texel are contiguous for all vertices."""
-    finest = np.asarray(transport.pyramid)[:, : 6 * transport.size**2 // 8]
-    turned = jax.device_put(np.ascontiguousarray(finest.T))
+    turned = jax.device_put(np.ascontiguousarray(transport.packed.T))
     return TexelBits(turned, transport.position, transport.frame, transport.size)
 
 

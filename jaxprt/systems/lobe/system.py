@@ -14,6 +14,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from jaxprt import require
@@ -22,9 +23,10 @@ from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import cubemap, directions
-from jaxprt.systems import protocol
+from jaxprt.systems import harmonic, protocol
 from jaxprt.systems.lobe import diffuse
 from jaxprt.systems.lobe.blurred_light import LobeLight, prefilter, scales
+from jaxprt.systems.lobe.exported import DEGREE, CoarseTransport, ExportedLobes
 from jaxprt.systems.lobe.pyramid import LobeTransport, between, corners
 from jaxprt.systems.lobe.table import LobeBrdf, Lobes
 from jaxprt.systems.protocol import Blend
@@ -126,6 +128,15 @@ class LobeSystem(protocol.VertexSystem):
             light = self.shade(light)
         return combine(light, view)
 
+    def exported(self, what: str) -> ExportedLobes:
+        """The table of lobes, averaged visibility, and transfer vectors for the diffuse part: `System.exported`."""
+        vector = diffuse.harmonics_of(self.transport.vector, size=self.transport.size, degree=DEGREE)
+        return ExportedLobes(self, np.asarray(vector, np.float64), np.zeros((0, self.vertices)))
+
+    def coarse(self, transport: CoarseTransport) -> "CoarseLobes":
+        """The same lobes with coarser visibility, for a light that is reduced to the size of the transport."""
+        return CoarseLobes(transport, self.brdf)
+
     @property
     def lobe_table(self) -> LobeBrdf:
         """The BRDF."""
@@ -140,6 +151,16 @@ class LobeSystem(protocol.VertexSystem):
     def shared_light(self) -> tuple:
         """Key of the light, which depends on the environment and its size only."""
         return LobeSystem, self.transport.size
+
+
+class CoarseLobes(LobeSystem):
+    """A lobe system that reduces the resolution of its light, and lights diffuse parts by harmonics."""
+
+    def light(self, environment: Environment) -> LobeLight:
+        """The light at reduced resolution, blurred for lobes."""
+        radiance = cubemap.reduced(environment.radiance, size=self.transport.size)
+        light = super().light(Environment(radiance))
+        return dataclasses.replace(light, coefficient=harmonic.project(environment, degree=DEGREE))
 
 
 def _brdf(value: Any) -> None:
@@ -359,6 +380,12 @@ class MatteSystem(protocol.VertexSystem):
             irradiance = diffuse.irradiance(light.coefficient, self.transport.vector)
         protocol.check_colors(len(irradiance), view.shape[1])
         return diffuse.at_points(irradiance, light.flux, self.points).T * view
+
+    def exported(self, what: str) -> protocol.Exported:
+        """The transfer vectors in spherical harmonics: `System.exported`."""
+        vector = diffuse.harmonics_of(self.transport.vector, size=self.transport.size, degree=DEGREE)
+        transport = harmonic.TransferVector(vector[:, None], self.transport.position)
+        return harmonic.DiffuseSystem(transport, self.albedo).exported(what)
 
     @property
     def matte(self) -> bool:

@@ -32,6 +32,7 @@ _ROUNDS = ((2, 0.5), (2, 0.5), (2, 0.25), (2, 0.25), (2, 0.1), (2, 0.1), (3, 0.0
 _DEGREE = 24  # of the natural light under which the error of a table is measured
 _COUNTS = (2, 4, 6, 8, 12, 16, 24, 32)
 _TINY = 1e-12
+_GRAZING = 1e-3  # smallest cosine by which the lobes are divided
 WIDE, NARROW = 8.0, 32.0  # concentrations below which harmonics represent a lobe, and above which rays do
 
 
@@ -177,6 +178,10 @@ class LobeBrdf(eqx.Module):
         batch = wo.shape[:-1]
         value = self.lookup(wo.reshape(-1, 3)).evaluate(wi.reshape(-1, 3))
         return value.T.reshape(*batch, len(self.weight))
+
+    def value(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
+        """Value of the lobes in 1/sr: without the cosine of wi, which counts as at least 0.001."""
+        return self(wi, wo) / jnp.maximum(wi[..., 2:], _GRAZING)
 
 
 @jit
