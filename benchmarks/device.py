@@ -24,7 +24,7 @@ from benchmarks import harness
 from benchmarks.published.quantized import quantize
 from benchmarks.rasterize import facing, torus
 from benchmarks.relight_separable import synthetic
-from jaxprt import System, bounces, bright_texels, dynamic, harmonic, lobe, memory, separable
+from jaxprt import Blend, System, bounces, bright_texels, dynamic, harmonic, lobe, memory, separable
 from jaxprt.brdf import CookTorrance
 from jaxprt.image import rasterize, resolve, shading_points
 from jaxprt.scene import Environment, Mesh
@@ -135,19 +135,15 @@ class Maker:
         """Pyramids and eight lobes."""
         return lobe.LobeSystem(self.pyramids(vertices), self.lobes()), None
 
-    def dynamic(self, vertices: int) -> tuple[Any, Any]:
-        """One region, whose BRDFs have lobes and two terms."""
+    def dynamic(self, vertices: int) -> tuple[dynamic.DynamicSystem, Any]:
+        """A BRDF of three channels, with lobes and two terms."""
         maps = self.normal(2, 32, 32), self.normal(2, 32, 32)
-        cores = self.normal(2, 2, 2), self.normal(3, 1, 2)
-        brdf = dynamic.BrdfSet(*cores, *maps, self.lobes(3), None, jnp.asarray(0.0))
-        row = jnp.arange(vertices, dtype=jnp.int32)
-        region = dynamic.RegionTransport(self.clusters(vertices, 3), self.pyramids(vertices, diffuse=False), row)
-        material = dynamic.Material(np.array([0.2, 0.3, 0.5]), self.uniform(3), self.uniform(vertices, 3))
-        return dynamic.SetSystem(dynamic.SetTransport((region,), row), (brdf,)), [material]
+        brdf = dynamic.DynamicBrdf(self.lobes(), self.normal(2, 2, 2), self.normal(3, 2), *maps, jnp.asarray(0.0))
+        transport = dynamic.DynamicTransport(self.clusters(vertices, 3), self.pyramids(vertices))
+        return dynamic.DynamicSystem(transport, brdf), Blend(self.uniform(vertices, 3, 3))
 
     def bounces(self, vertices: int) -> tuple[System, Any]:
-        """One and two bounces of that region."""
-        direct, materials = self.dynamic(vertices)
+        """One and two bounces of three path functions, the channels of one BRDF."""
         count = -(-vertices // MEMBERS)
         row = jnp.arange(vertices, dtype=jnp.int32)
         second = bounces.SecondBounce(
@@ -161,12 +157,46 @@ class Maker:
             0 * row,
             self.uniform(vertices),
             jnp.arange(3, dtype=jnp.int32),
-            (self.normal(3, 1, 2),),
+            (jnp.eye(3),),
             second,
             jnp.zeros(count),
             jnp.ones(2),
         )
-        return bounces.BouncesSystem(tensor, direct), materials
+        table = harmonic.HarmonicBrdf(self.normal(16, 3, 48), (), jnp.asarray(0.0))
+        group = bounces.ReflectingPart(*self.place(vertices), table)
+        made = bounces.GroupBounces.make(tensor, [group], [np.asarray(row)])
+        return OneGroup(made), Blend(self.uniform(vertices, 3, 3))
+
+
+class OneGroup(System):
+    """Reflected light alone, of a scene of one group. Materials are a `Blend`."""
+
+    bounces: bounces.GroupBounces
+
+    def light(self, environment: Environment) -> Any:
+        """Applies the tensor to a light."""
+        return self.bounces.light(environment)
+
+    def shade(self, light: Any, materials: Any = None) -> Any:
+        """Harmonics of the light that arrives at the vertices."""
+        return self.bounces.shade(light, [materials])[0]
+
+    def view(self, eye: jax.Array, materials: Any = None) -> Any:
+        """Harmonics of the BRDF."""
+        return self.bounces.group[0].view(eye, materials)
+
+    def combine(self, light: Any, view: Any) -> jax.Array:
+        """Radiance of reflected light."""
+        return self.bounces.group[0].combine(light, view)
+
+    def at(self, points: Any) -> System:
+        """There are no points in benchmarks."""
+        raise NotImplementedError
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices."""
+        return len(self.bounces.place)
 
 
 SYSTEMS: dict[str, Callable[[Maker, int], tuple[System, Any]]] = {

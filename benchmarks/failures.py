@@ -21,8 +21,8 @@ from benchmarks.pictures import BRDFS, LIGHTS, standing
 from benchmarks.pictures import view as view_of
 from benchmarks.published import interiors
 from benchmarks.scenes import averaged, finer, traced_parts
-from jaxprt import dynamic, files, image, memory, precompute, radiance, reference
-from jaxprt.brdf import CookTorrance, navigation
+from jaxprt import Blend, bright_texels, dynamic, files, image, memory, precompute, radiance, reference
+from jaxprt.brdf import CookTorrance
 from jaxprt.image import raster
 from jaxprt.relit import Harmonics, Lobes, Terms
 from jaxprt.scene import (
@@ -142,19 +142,23 @@ def direct(mesh: str, light: str, brdf: str, recipes: dict[str, Any], sizes: Siz
 
 
 def changing(sizes: Sizes) -> Pictures:
-    """Materials between the BRDFs of a set, that are far apart in roughness or less far."""
+    """A BRDF halfway between two that are tabulated, which are far apart in roughness or less far."""
     mesh, light = load_mesh(harness.data() / "meshes" / "spot.obj"), environment("eucalyptus")
-    camera = view_of(mesh, 2.6, sizes.edge)
-    place, mine = jnp.array([0.3, 0.14]), {}
-    for name, (low, high) in {"m .035 and .56": (0.035, 0.56), "m .1 and .196": (0.1, 0.196)}.items():
-        family = navigation.cook_torrance(point=np.array([(f0, m) for f0 in (0.0, 1.0) for m in (low, high)]))
-        members = dynamic.factor(family.brdf, dynamic.separate(family.brdf, lobes=8))
-        system = dynamic.SetSystem(dynamic.precompute_sets(mesh, [members], progress=False), (members,))
-        material = [dynamic.Material(family.navigation.weight(place), diffuse=0.0, specular=1.0)]
-        color = radiance(system, light, eye=camera.eye, materials=material)
+    camera, mine = view_of(mesh, 2.6, sizes.edge), {}
+
+    def model(log_m):
+        return CookTorrance(diffuse=0.0, specular=1.0, roughness=jnp.exp(log_m), f0=0.3)
+
+    log_m, count = np.log(0.14), len(mesh.position)
+    blend = Blend(jnp.ones((count, 1, 1)), (jnp.full(count, log_m),))
+    for name, ends in {"m .035 and .56": (0.035, 0.56), "m .1 and .196": (0.1, 0.196)}.items():
+        table = dynamic.tabulate(model, lobes=8, ranks=None, knot=[np.log(ends)])
+        transport = dynamic.precompute(mesh, table, progress=False)
+        system = bright_texels.BrightTexels(dynamic.DynamicSystem(transport, table), transport.pyramid, model)
+        color = radiance(system, light, eye=camera.eye, materials=blend)
         mine[name] = (lambda color=color: image.render(mesh, color, camera)), memory(system)
-    model = CookTorrance(diffuse=0.0, specular=1.0, roughness=place[1], f0=place[0])
-    exact = np.asarray(image.render(mesh, reference.radiance(mesh, model, light, eye=camera.eye), camera))[..., :3]
+    exact = reference.radiance(mesh, model(jnp.asarray(log_m)), light, eye=camera.eye)
+    exact = np.asarray(image.render(mesh, exact, camera))[..., :3]
     return Pictures(mine, (exact, exact), inside(mesh, camera))
 
 

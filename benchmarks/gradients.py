@@ -11,11 +11,9 @@ quickest. `hessian` lines have the product of the Hessian of the squared radianc
 Visibility and transport are random numbers on 36,000 random vertices, which is harder on caches than a mesh.
 """
 
-import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +21,7 @@ from jaxtyping import PyTree
 
 import jaxprt as prt
 from benchmarks import harness, relight_separable
+from benchmarks.device import OneGroup
 from jaxprt import bounces, brdf, bright_texels
 from jaxprt import dynamic as dynamic_system
 from jaxprt import harmonic as harmonic_system
@@ -31,8 +30,9 @@ from jaxprt import separable as separable_system
 from jaxprt.brdf import AshikhminShirley
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import directions
+from jaxprt.systems import standard
 from jaxprt.systems.bounces import SecondBounce, TransferTensor
-from jaxprt.systems.dynamic import Material, RegionTransport, SetTransport
+from jaxprt.systems.dynamic import DynamicTransport
 from jaxprt.systems.harmonic import TransferMatrix
 from jaxprt.systems.lobe import LobeTransport
 from jaxprt.systems.separable import ClusteredTransport, SeparableBrdf
@@ -172,41 +172,47 @@ def lobe(vertices: int) -> Case:
 
 
 def dynamic(vertices: int) -> Case:
-    """Direct light on a region that changes, with four lobes."""
-    family, members = changing()
-    transport = _region(vertices)
+    """Direct light on Cook-Torrance's model, with twelve lobes, a tensor and sixteen texels."""
+    transport, system = _dynamic(vertices)
 
     def radiance(light, material, eye):
-        made = [mixed(family, material)]
-        return dynamic_system.radiance(transport, [members], made, Environment(light), eye=eye, texels=TEXELS)
+        return prt.radiance(system, Environment(light), eye=eye, materials=mixed(material, vertices))
 
     return Case(radiance, arguments(), transport.nbytes)
 
 
 def transfer(vertices: int) -> Case:
     """The same with one bounce and two."""
-    family, members = changing()
-    transport = _region(vertices)
-    tensor = _bounces(vertices, bounces.factor(family.brdf, navigation=family.navigation).factor)
+    transport, system = _dynamic(vertices)
+    brdf, sent = standard.COOK_TORRANCE.paths()
+    place = transport.position, transport.frame
+    group = bounces.ReflectingPart(*place, standard.COOK_TORRANCE.harmonics(3), sent=sent)
+    tensor = _bounces(vertices, bounces.functions.fixed_weights(brdf))
+    reflected = OneGroup(bounces.GroupBounces.make(tensor, [group], [np.arange(vertices)]))
 
     def radiance(light, material, eye):
-        made = [mixed(family, material)]
-        direct_and_bounces = (transport, tensor, [members], made, Environment(light))
-        return bounces.radiance(*direct_and_bounces, eye=eye, texels=TEXELS)
+        both = prt.total(system, reflected)
+        return prt.radiance(both, Environment(light), eye=eye, materials=mixed(material, vertices))
 
     return Case(radiance, arguments(), transport.nbytes + tensor.nbytes)
 
 
-def changing():
-    """Cook-Torrance's model over Fresnel reflectance and roughness, and its lobes."""
-    family = brdf.navigation.cook_torrance(point=np.array(list(itertools.product((0.0, 1.0), (0.1, 0.2, 0.4)))))
-    return family, dynamic_system.factor(family.brdf, dynamic_system.separate(family.brdf, lobes=4))
+def _dynamic(vertices: int) -> tuple[DynamicTransport, bright_texels.BrightTexels]:
+    """Random transport, and the system of Cook-Torrance's model."""
+    table = standard.COOK_TORRANCE
+    seen = _seen(vertices)
+    terms = _clustered(vertices, terms=table.tensor().terms + 1, components=24, modes=128, keep=1024)
+    transport = DynamicTransport(terms, seen)
+    system = dynamic_system.DynamicSystem(transport, table.tensor())
+    return transport, bright_texels.BrightTexels(system, seen, table.family, count=TEXELS)
 
 
-def mixed(family, material) -> Material:
-    """A material of diffuse and specular weights and coordinates."""
-    diffuse, specular, place = material
-    return Material(family.navigation.weight(place), diffuse, specular)
+def mixed(material, vertices: int) -> prt.Blend:
+    """A material of diffuse and specular colors, Fresnel reflectance and roughness: base, mirror and rim."""
+    diffuse, specular, (f0, roughness) = material
+    weight = jnp.stack([diffuse, f0 * specular, (1 - f0) * specular]) / standard.COOK_TORRANCE.scale[:, None]
+    parameter = jnp.broadcast_to(jnp.log(roughness), vertices)
+    return prt.Blend(jnp.broadcast_to(weight, (vertices, 3, 3)), (parameter,))
 
 
 def arguments() -> dict[str, PyTree]:
@@ -258,15 +264,8 @@ def _seen(vertices: int) -> LobeTransport:
     return LobeTransport(jnp.asarray(pyramid), jnp.asarray(vector), position, frame, SIZE)
 
 
-def _region(vertices: int) -> SetTransport:
-    terms = _clustered(vertices, terms=1, components=24, modes=24, keep=1024)
-    row = jnp.arange(vertices)
-    seen = eqx.tree_at(lambda x: x.vector, _seen(vertices), jnp.zeros((0, vertices), jnp.uint8))
-    return SetTransport((RegionTransport(terms, seen, row),), row)
-
-
 def _bounces(vertices: int, factor: jax.Array) -> TransferTensor:
-    clusters, functions, random = vertices // MEMBERS, factor.shape[-1] + 1, np.random.default_rng(2)
+    clusters, functions, random = vertices // MEMBERS, len(factor), np.random.default_rng(2)
     weight, mode, again = (
         random.standard_normal(shape, dtype=np.float32)
         for shape in ((clusters, MEMBERS, 32), (clusters, 384, 64), (clusters, MEMBERS, 16))
