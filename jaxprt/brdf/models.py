@@ -99,6 +99,8 @@ class Model(eqx.Module):
         least: Smallest allowed values by parameter name, where they differ from 0.
         lobe_width: Parameters that set the width of lobes, with the power of the width that they are: 1 for GGX's alpha
             or Beckmann's m, 1/2 for a perceptual roughness, and -2 for an exponent n, of width (2 / (n + 2))^(1/2).
+            Empty for models without lobes.
+        matte: Whether the model is ideal diffuse reflection by its `albedo`, for which systems need no table.
 
     Raises:
         TypeError: A parameter does not consist of real numbers.
@@ -107,6 +109,7 @@ class Model(eqx.Module):
 
     least: ClassVar[Mapping[str, float]] = {}
     lobe_width: ClassVar[Mapping[str, float]] = {}
+    matte: ClassVar[bool] = False
 
     def widened(self, width: float) -> "Model":
         """The model with lobes that are at least so wide: `width` is GGX's alpha, or Beckmann's m."""
@@ -128,6 +131,8 @@ class Lambert(Model):
     Attributes:
         albedo: Albedo; gray or a color.
     """
+
+    matte: ClassVar = True
 
     albedo: Float[Array, " c"] = eqx.field(converter=color, default=0.5)
 

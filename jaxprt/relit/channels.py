@@ -73,13 +73,13 @@ class Shading(eqx.Module):
     @property
     def matte(self) -> bool:
         """Whether the surface is ideally diffuse."""
-        return isinstance(self.brdf, Lambert)
+        return getattr(self.brdf, "matte", False)
 
     @property
     def albedo(self) -> Array:
         """Albedo of an ideally diffuse surface."""
-        assert isinstance(self.brdf, Lambert)
-        return self.brdf.albedo
+        brdf: Any = self.brdf
+        return brdf.albedo
 
     @property
     def layered(self) -> bool:

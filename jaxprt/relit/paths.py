@@ -15,8 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxprt.brdf import Lambert
-from jaxprt.brdf.microfacet import SchlickDiffuse
 from jaxprt.brdf.varying import Channels
 from jaxprt.relit.channels import Shading
 from jaxprt.systems import bounces, harmonic, separable, standard
@@ -135,7 +133,8 @@ def _widens(part: Any) -> bool:
 
 def _alone(brdf: Callable) -> separable.SeparableBrdf:
     """The factored BRDF of a part whose BRDF has its own channels."""
-    made = separable.factor(widened(brdf), terms=1 if isinstance(brdf, Lambert) else _TERMS, resolution=_RESOLUTION)
+    terms = 1 if getattr(brdf, "matte", False) else _TERMS
+    made = separable.factor(widened(brdf), terms=terms, resolution=_RESOLUTION)
     kept = np.atleast_1d(bounces.functions.albedo(made))
     scale = np.where(kept > _DARK, channels(brdf) / np.maximum(kept, _DARK), 1)
     return eqx.tree_at(lambda each: each.view_map, made, made.view_map * jnp.asarray(scale, made.view_map.dtype))
@@ -153,7 +152,7 @@ def _matte(brdf: Callable) -> np.ndarray | None:
     """Which channels of a BRDF are diffuse; None if the BRDF has no channels."""
     if not isinstance(brdf, Channels):
         return None
-    return np.array([isinstance(each, Lambert | SchlickDiffuse) for each in brdf.model])
+    return np.array([not model.lobe_width for model in brdf.model])
 
 
 def _lobes(brdf: Callable, which: np.ndarray) -> Callable:
