@@ -26,7 +26,7 @@ Conventions, everywhere in this package:
 """
 
 from jaxprt import brdf, decompose, files, image, inverse, relit, scene, sphere, view, visibility
-from jaxprt.relit import RelitScene, plan, precompute, refine
+from jaxprt.relit import RelitScene, plan, precompute, refine, register
 from jaxprt.scene import Camera, Environment, Part, Scene, load_environment, load_mesh, load_scene
 from jaxprt.systems import bounces, bright_texels, dynamic, harmonic, lamps, lobe, reference, separable
 from jaxprt.systems.devices import shard
@@ -60,6 +60,7 @@ __all__ = [
     "radiance",
     "reference",
     "refine",
+    "register",
     "relit",
     "scene",
     "separable",

@@ -22,7 +22,7 @@ import pytest
 import trimesh
 
 import jaxprt as prt
-from jaxprt.relit import Clusters, Harmonics
+from jaxprt.relit import Clusters, Harmonics, recipes
 
 pytestmark = pytest.mark.documents
 
@@ -114,9 +114,9 @@ def small(coarse: None, bound) -> Iterator[None]:
             (prt.bounces.precompute, {"edge": 2, "components": 8, "modes": 8}),
         ):
             bound(patch, function, **limits)
-        patch.setattr(planning, "_TERMS", tuple(Clusters(each.terms, 12) for each in planning._TERMS[:1]))
-        patch.setattr(planning, "_LOBES", planning._LOBES[:2])
-        patch.setattr(planning, "_HARMONIC", (Harmonics(degree=2),))
+        patch.setattr(recipes, "_CLUSTERS", tuple(Clusters(step.terms, 12) for step in recipes._CLUSTERS[:1]))
+        patch.setattr(recipes, "_LOBES", recipes._LOBES[:2])
+        patch.setattr(recipes, "_HARMONIC", (Harmonics(degree=2),))
         patch.setattr(measuring, "_PICTURE", 32)
         patch.setattr(measuring, "_PIXELS", 30)
         for module in (measuring, planning):

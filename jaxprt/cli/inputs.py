@@ -22,7 +22,7 @@ import numpy as np
 from jaxprt import brdf
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.cli.report import View
-from jaxprt.relit import refinement
+from jaxprt.relit import refinement, registry
 from jaxprt.scene import Environment, Part, Scene, TexturedMaterial, builtin, load_environment, load_scene
 from jaxprt.scene import mesh as meshes
 from jaxprt.scene.camera import orbit
@@ -31,22 +31,6 @@ from jaxprt.scene.formats.mesh_file import SUFFIXES
 from jaxprt.scene.scene import centered, unique_names
 from jaxprt.scene.sides import two_sided
 
-MODELS: dict[str, type] = {
-    "lambert": brdf.Lambert,
-    "phong": brdf.Phong,
-    "blinn-phong": brdf.BlinnPhong,
-    "ashikhmin-shirley": brdf.AshikhminShirley,
-    "ward": brdf.Ward,
-    "ward-duer": brdf.WardDuer,
-    "cook-torrance": brdf.CookTorrance,
-    "lafortune": brdf.Lafortune,
-    "poulin-fournier": brdf.PoulinFournier,
-    "poulin-fournier-grooves": brdf.PoulinFournierGrooves,
-    "ggx": brdf.GGX,
-    "ggx-interface": brdf.GGXInterface,
-    "charlie": brdf.Charlie,
-    "metallic-roughness": TexturedMaterial,
-}
 # Loader of each kind of file, and its further options: True for required ones.
 FILES: dict[str, tuple[Callable, dict[str, bool]]] = {
     "merl": (brdf.load_merl, {}),
@@ -75,14 +59,15 @@ def parse(text: str) -> Callable | TexturedMaterial:
         ValueError: A model, parameter or file does not exist, or a value is not a number or out of range.
         OSError: A file cannot be read.
     """
+    models = registry.materials()
     name, _, rest = text.partition(":")
     words = [word.strip() for word in rest.split(",")] if rest.strip() else []
-    if name in FILES and ((words and "=" not in words[0]) or name not in MODELS):
+    if name in FILES and ((words and "=" not in words[0]) or name not in models):
         return _load_measured(name, words)
-    if name not in MODELS:
-        names = ", ".join(dict.fromkeys([*MODELS, *FILES]))
+    if name not in models:
+        names = ", ".join(dict.fromkeys([*models, *FILES]))
         raise ValueError(f"a material must be one of {names}, got {name!r}")
-    kind, arguments = MODELS[name], {}
+    kind, arguments = models[name], {}
     known = parameters(name)
     for word in words:
         key, equals, value = word.partition("=")
@@ -101,7 +86,7 @@ def parse(text: str) -> Callable | TexturedMaterial:
 def parameters(name: str) -> dict[str, float | None]:
     """Numeric parameters of a model with their defaults; None for required ones."""
     result = {}
-    for field in inspect.signature(MODELS[name]).parameters.values():
+    for field in inspect.signature(registry.materials()[name]).parameters.values():
         if not field.name.endswith("_texture") and not isinstance(field.default, str):
             result[field.name] = None if field.default is inspect.Parameter.empty else float(field.default)
     return result

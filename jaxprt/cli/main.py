@@ -12,6 +12,7 @@ from click.shell_completion import get_completion_class
 
 import jaxprt
 from jaxprt.cli import export, info, inputs, measure, options, planned, play, relight
+from jaxprt.relit import registry
 
 _SHELLS = {"bash": "~/.bashrc", "zsh": "~/.zshrc", "fish": "~/.config/fish/completions/jaxprt.fish"}
 _INTERRUPTED = 130
@@ -55,8 +56,8 @@ class Program(click.Group):
 
 _EPILOG = f"""\b
 Materials, for --brdf and --material:
-  models      {", ".join(list(inputs.MODELS)[:7])},
-              {", ".join(list(inputs.MODELS)[7:])}
+  models      {", ".join(list(registry.MATERIALS)[:7])},
+              {", ".join(list(registry.MATERIALS)[7:])}
   numbers     ward:diffuse=.1/.05/.02,specular=.3,along=.1,across=.3   colors have slashes
   files       {", ".join(map(inputs.form, inputs.FILES))}
 """

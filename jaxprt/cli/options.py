@@ -13,7 +13,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from jaxprt.cli import inputs
-from jaxprt.relit import Clusters, Dynamic, Harmonics, Lobes, Terms
+from jaxprt.relit import Clusters, Dynamic, Harmonics, Lobes, Terms, registry
 from jaxprt.relit.recipes import Recipe
 
 LAPLACIAN = {"none": 1.0, "laplacian": 0.4}  # fraction of the squared Laplacian that each window preserves
@@ -54,6 +54,8 @@ def recipes(system: str, options: SimpleNamespace, *, lobes: int = _COUNT) -> di
         return {system: Harmonics(options.order - 1, LAPLACIAN[options.window])}
     if system == "dynamic":
         return _dynamic(options)
+    if system not in NAMES:
+        return {system: registry.systems()[system]}
     names = ("terms", "keep") if system == "separable" else ("terms", "keep", "components", "modes", "texels")
     values = {name: value for name in names if (value := getattr(options, name)) is not None}
     return {system: Terms(**values) if system == "separable" else Clusters(**values)}
@@ -247,10 +249,10 @@ class Material(click.ParamType):
         """Completes the name, then its parameters."""
         name, colon, rest = incomplete.partition(":")
         if not colon:
-            names = dict.fromkeys([*inputs.MODELS, *inputs.FILES])
+            names = dict.fromkeys([*registry.materials(), *inputs.FILES])
             return [CompletionItem(f"{known}:") for known in names if known.startswith(name)]
         before, comma, last = rest.rpartition(",")
-        known = inputs.parameters(name) if name in inputs.MODELS else {}
+        known = inputs.parameters(name) if name in registry.materials() else {}
         return [
             CompletionItem(f"{name}:{before}{comma}{parameter}=") for parameter in known if parameter.startswith(last)
         ]
@@ -451,9 +453,22 @@ bounces = option("--bounces", group="System", type=Bounces(), help='Number of bo
 as_json = option("--json", "as_json", group="Output", is_flag=True, help="Print the result as JSON on stdout.")
 
 
+class SystemName(click.Choice):
+    """Names of systems: some of jaxprt's, and those of other packages."""
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """All names."""
+        return (*self._names, *(name for name in registry.systems() if name not in NAMES))
+
+    @choices.setter
+    def choices(self, names: tuple[str, ...]) -> None:
+        self._names = names
+
+
 def systems(names: Sequence[str], *, default: str | None, words: str) -> Callable:
     """The option --system."""
-    return option("--system", group="System", type=Several(click.Choice(list(names))), default=default, help=words)
+    return option("--system", group="System", type=Several(SystemName(names)), default=default, help=words)
 
 
 def folder(words: str, *, default: str | None = None) -> Callable:

@@ -1,11 +1,12 @@
 """Saving, loading and pickling of the package's objects: transports, BRDFs, plans, lights, meshes.
 
 A saved object is a folder with a NumPy file for each array and a JSON description of the object's classes and fields.
-It contains no pickle. Loading creates only objects of this package's classes and fills their fields; it never calls a
-function that a file names.
+It contains no pickle. Loading creates only objects of this package's classes, or of classes that other packages have
+registered, and fills their fields; it never calls a function that a file names.
 
-A folder may come from a stranger. Nothing is unpickled, only data classes of this package are looked up, and only
-regular files in the folder are read. Whatever differs from what `jaxprt.files.objects.save` writes is refused.
+A folder may come from a stranger. Nothing is unpickled, nothing but modules of this package is imported because a file
+names it, and only regular files in the folder are read. Whatever differs from what `jaxprt.files.objects.save` writes
+is refused.
 """
 
 import collections.abc
@@ -32,7 +33,7 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxprt import require
-from jaxprt.files import arrays, inputs
+from jaxprt.files import arrays, extensions, inputs
 
 _PLAIN: dict[Any, tuple[type, ...]] = {
     bool: (bool, np.bool_),
@@ -239,7 +240,7 @@ class _Reader:
         self.value = self._make(tree, False)
 
     def _check_algorithm(self, name: str, version: Any) -> None:
-        _check_module(name)
+        _check_module(self._path, name)
         if algorithm_of(name) != version:
             raise _KnownError(
                 f"{self._path} was made by version {str(version)[:80]} of the algorithm in {name}, this jaxprt has "
@@ -347,14 +348,11 @@ def _read(path: Path, number: int, entry: Any) -> np.ndarray:
 
 
 def _class(path: Path, name: str) -> type:
-    """A data class of this package, by name. Nothing else is ever looked up."""
+    """A data class of this package, or one that another package has registered, by name."""
     module, _, kind = name.partition(":")
-    try:
-        _check_module(module)
-    except ValueError as error:
-        raise _KnownError(f"{path} {error}") from None
-    result = getattr(sys.modules[module], kind, None)
-    if not isinstance(result, type) or result.__module__ != module or not is_ours(result):
+    _check_module(path, module)
+    result = extensions.CLASSES.get(name) or getattr(sys.modules.get(module), kind, None)
+    if not isinstance(result, type) or result.__module__ != module or not _is_known(result):
         raise _KnownError(
             f"{path} names the class {name[:80]!r}, which this jaxprt does not have: it is damaged, or was saved by "
             "another version"
@@ -362,28 +360,33 @@ def _class(path: Path, name: str) -> type:
     return result
 
 
-def _check_module(name: str) -> None:
-    """Imports a module of this package. Refuses all other modules."""
-    try:
-        if not re.fullmatch(r"jaxprt(\.[a-z][a-z_]*)+", name):
-            raise ImportError(name)
-        importlib.import_module(name)
-    except ImportError:
-        raise ValueError(
-            f"names the module {name[:80]!r}, which this jaxprt does not have: it is damaged, or was saved by another "
-            "version"
-        ) from None
+def _check_module(path: Path, name: str) -> None:
+    """Imports a module of this package. Modules of other packages are never imported because a file names them."""
+    if re.fullmatch(r"jaxprt(\.[a-z][a-z_]*)+", name):
+        try:
+            importlib.import_module(name)
+        except ImportError:
+            raise _KnownError(
+                f"{path} names the module {name[:80]!r}, which this jaxprt does not have: it is damaged, or was saved "
+                "by another version"
+            ) from None
+        return
+    if name not in extensions.modules():
+        raise _KnownError(
+            f"{path} names the module {name[:80]!r}, of which no class is registered: import the package that calls "
+            "jaxprt.register for its classes, or it is damaged"
+        )
 
 
-def is_ours(kind: type) -> bool:
-    """Whether a class is a data class or a named tuple of this package."""
-    named = issubclass(kind, tuple) and hasattr(kind, "_fields")
-    return kind.__module__.startswith("jaxprt.") and (dataclasses.is_dataclass(kind) or named)
+def _is_known(kind: type) -> bool:
+    """Whether files may hold objects of a class: a data class of this package, or a registered one."""
+    ours = kind.__module__.startswith("jaxprt.") and extensions.is_data(kind)
+    return ours or extensions.CLASSES.get(extensions.full_name(kind)) is kind
 
 
 def algorithm_of(module: str) -> Any:
     """Versions of the algorithms that compute the objects of a module."""
-    return getattr(sys.modules[module], "ALGORITHM", 1)
+    return getattr(sys.modules.get(module), "ALGORITHM", 1)
 
 
 def function_name(value: Any) -> str | None:
@@ -428,6 +431,8 @@ def _header(path: Path) -> dict[str, Any]:
 def save(path: str | os.PathLike, object: Any) -> None:
     """Saves an object of this package, or tuples, lists and dictionaries of such objects, without loss.
 
+    Objects of other packages are saved if `jaxprt.register` has their classes.
+
     The folder is written under a temporary name and renamed when it is complete, so a killed process never leaves an
     incomplete object. An existing folder or file is never replaced.
 
@@ -439,8 +444,8 @@ def save(path: str | os.PathLike, object: Any) -> None:
     Raises:
         FileExistsError: `path` already exists.
         TypeError: The object holds something that cannot be saved: a function, such as a BRDF that is not a model of
-            this package, an object of another package, values that JAX is tracing, or fields that the object's class
-            does not allow, such as gradients in place of parameters.
+            this package, an object of a class that is not registered, values that JAX is tracing, or fields that the
+            object's class does not allow, such as gradients in place of parameters.
     """
     path = Path(path)
     if path.exists():
@@ -523,9 +528,10 @@ def _describe(value: Any, place: str, arrays: list, modules: set[str], batched: 
     if (name := function_name(value)) is not None:
         return {"function": name}
     kind = type(value)
-    if not is_ours(kind):
+    if not _is_known(kind):
         got = f"the function {value}" if callable(value) and hasattr(value, "__name__") else f"a {kind.__name__}"
-        raise TypeError(f"{place} must be an object of jaxprt, arrays or plain values to be saved, got {got}")
+        cure = ", whose package must call jaxprt.register for it" if extensions.is_data(kind) else ""
+        raise TypeError(f"{place} must be an object of jaxprt, arrays or plain values to be saved, got {got}{cure}")
     modules.add(kind.__module__)
     field = {
         name: _describe(getattr(value, name), f"{place}.{name}", arrays, modules, batched or holds_models(kind, name))
@@ -535,7 +541,7 @@ def _describe(value: Any, place: str, arrays: list, modules: set[str], batched: 
         check(value, batched=batched)
     except ValueError as error:
         raise TypeError(f"{place} must be a valid {kind.__name__} to be saved and loaded again: {error}") from error
-    return {"class": f"{kind.__module__}:{kind.__qualname__}", "field": field}
+    return {"class": extensions.full_name(kind), "field": field}
 
 
 def _describe_array(value: Any, place: str, arrays: list) -> dict[str, Any]:

@@ -13,11 +13,11 @@ import tqdm
 from jaxprt import require
 from jaxprt.compile import promoted
 from jaxprt.files import objects
-from jaxprt.relit import channels, groups, lamps, refinement, reflection, tracing, warn
+from jaxprt.relit import channels, groups, lamps, refinement, reflection, registry, tracing, warn
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.measuring import checked, lights_of
 from jaxprt.relit.planning import ERROR, MARGIN, Plan, key_of, plan
-from jaxprt.relit.recipes import SYSTEMS, Recipe, Target, check
+from jaxprt.relit.recipes import Recipe, Target, check
 from jaxprt.relit.scene import RAYS, RelitScene
 from jaxprt.scene import Environment, Part, Scene, sides
 from jaxprt.scene.scene import centered, default_camera
@@ -57,9 +57,10 @@ def precompute(
 
     Args:
         scene: Scene from `jaxprt.load_scene`, or built from `jaxprt.Part`.
-        system: Name of a system ("lobe", "dynamic", "harmonic" or "separable"), or a recipe with its own parameters,
-            such as `jaxprt.relit.Lobes(lobes=8)`, or a dictionary from the name of each part to one of these. If None,
-            `jaxprt.plan` chooses the system with the fewest bytes that meets `error`, for each kind of material.
+        system: Name of a system ("lobe", "dynamic", "harmonic" or "separable", or one that `jaxprt.register` was
+            given), or a recipe with its own parameters, such as `jaxprt.relit.Lobes(lobes=8)`, or a dictionary from the
+            name of each part to one of these. If None, `jaxprt.plan` chooses the system with the fewest bytes that
+            meets `error`, for each kind of material.
         error: Largest relative L2 error of the radiance of each part. Only used by the plan. If None, 0.05, or the
             smallest error that can be reached, with a warning.
         environments: Environments under which the error must hold; see `jaxprt.plan`. Only used by the plan.
@@ -236,9 +237,10 @@ def _recipe(system, name: str, scene: Scene) -> Recipe:
             raise ValueError(f"systems must be given for each of the parts {names}, got {list(system)}")
         return _recipe(system[name], name, scene)
     if isinstance(system, str):
-        if system not in SYSTEMS:
-            raise ValueError(f"the system must be one of {', '.join(SYSTEMS)}, got {system!r}")
-        return SYSTEMS[system]
+        recipes = registry.systems()
+        if system not in recipes:
+            raise ValueError(f"the system must be one of {', '.join(recipes)}, got {system!r}")
+        return recipes[system]
     require.kind("the system", system, Recipe, source="jaxprt.relit.Lobes, Harmonics, Dynamic, Terms or Clusters")
     return system
 

@@ -20,10 +20,10 @@ from jaxtyping import Float
 from jaxprt import require
 from jaxprt.compile import promoted
 from jaxprt.files import objects
-from jaxprt.relit import channels, groups, refinement, reflection
+from jaxprt.relit import channels, groups, refinement, reflection, registry
 from jaxprt.relit.measuring import checked, lights_of, views_around
-from jaxprt.relit.recipes import Clusters, Harmonics, Lobes, Recipe
-from jaxprt.relit.sampling import MEMBERS, Candidate, Sample
+from jaxprt.relit.recipes import Lobes, Recipe, Terms
+from jaxprt.relit.sampling import Candidate, Sample
 from jaxprt.scene import Environment, Scene, sides
 from jaxprt.scene.scene import centered
 from jaxprt.visibility import blocks
@@ -32,24 +32,6 @@ ERROR = 0.05  # that is asked for where none is given
 MARGIN = 1.25  # safety factor on the error, for lights and views that were not measured
 _SAVING = 0.1  # smallest saving, as a fraction of the bytes, for which another system is measured
 _SLOW = 2.0  # a faster candidate may have this many times the bytes of one that is too slow
-
-# Ladders of increasing size. The parameters of each step of _SIZES contribute errors of similar size.
-_DIFFUSE = tuple(Harmonics(degree=degree) for degree in (2, 3, 4, 6, 8))
-_HARMONIC = tuple(Harmonics(degree=degree) for degree in (2, 3, 4))
-_LOBES = tuple(Lobes(*each) for each in ((2, 4), (4, 8), (8, 16), (12, 16), (16, 32), (24, 64)))
-_SIZES = (
-    (2, 64, 4, 8, 192, 2),
-    (4, 64, 8, 24, 256, 4),
-    (8, 64, 8, 32, 384, 4),
-    (16, 64, 12, 48, 512, 8),
-    (32, 64, 16, 80, 768, 16),
-    (48, 64, 16, 96, 1024, 16),
-    (64, 64, 24, 128, 1024, 32),
-    (96, 96, 32, 192, 1536, 64),
-    (128, 96, 48, 256, 1536, 64),
-    (192, 96, 64, 384, 2048, 128),
-)
-_TERMS = tuple(Clusters(*each, members=MEMBERS) for each in _SIZES)
 
 
 class GroupPlan(eqx.Module):
@@ -189,7 +171,7 @@ def plan(
     total, plans = len(mesh.position), []
     looks = channels.looks(scene.parts)
     shadings = [channels.of_part(part, look=look) for part, look in zip(scene.parts, looks, strict=True)]
-    parts = groups.kinds(shadings, [_LOBES[0]] * len(shadings))
+    parts = groups.kinds(shadings, [Lobes()] * len(shadings))
     for number, own in enumerate(tqdm.tqdm(parts, desc="plan", unit="group", disable=not progress)):
         members, names = [scene.parts[part] for part in own], tuple(scene.parts[part].name for part in own)
         sample = Sample.make(members, [shadings[part] for part in own], mesh, total, size, environments, views)
@@ -197,7 +179,7 @@ def plan(
         kept = None if path is None else pathlib.Path(path) / f"{key}_{number}"
         alone = None
         if len(own) == 1:
-            alone = sample.alone(members[0], channels.of_part(members[0], look=looks[own[0]], takes=_TERMS[0].takes))
+            alone = sample.alone(members[0], channels.of_part(members[0], look=looks[own[0]], takes=Terms().takes))
         considered = tuple(_considered(sample, alone, kept, asked, count / total / rate))
         good = [each for each in considered if each.error * MARGIN <= asked]
         if not good:
@@ -242,7 +224,7 @@ def key_of(scene: Scene, environments: Sequence[Environment]) -> str:
 
 
 def _considered(sample: Sample, alone: Sample | None, folder: pathlib.Path | None, error: float, seconds: float):
-    """Measures candidates of each system: a bisection along its ladder, to the first step that meets the error.
+    """Measures candidates of each system: a bisection along its steps, to the first that meets the error.
 
     `alone` is the sample with a BRDF that can be factored; None for groups without such a BRDF.
 
@@ -250,21 +232,15 @@ def _considered(sample: Sample, alone: Sample | None, folder: pathlib.Path | Non
     candidate is too slow); those close to a step that misses the error by far; and those of a system whose smallest
     step would save less than a tenth of the bytes.
     """
-    if sample.shading.matte:
-        ladders: list[tuple] = [_DIFFUSE]
-    else:
-        ladders = [_HARMONIC, _LOBES] + ([] if alone is None else [_TERMS])
-    table = sample.shading.table
-    if table is not None:
-        ladders = [tuple(each for each in own if own is _TERMS or each.takes(table)) for own in ladders]
+    ladders = [_ladder(recipe, sample, alone) for recipe in registry.systems().values()]
     most = math.inf  # largest number of bytes that is worth measuring
-    for ladder in ladders:
-        least = [sample.least_bytes(recipe) for recipe in ladder]
+    for ladder in filter(None, ladders):
+        least = [sample.least_bytes(recipe) for recipe, _ in ladder]
         low, high = 0, sum(each <= most for each in least)
         while low < high:  # Assumption: from one step to the next, the error decreases by at most half.
             middle = (low + high) // 2
-            own = alone if alone is not None and isinstance(ladder[middle], Clusters) else sample
-            each = _measured(own, ladder[middle], folder)
+            recipe, measured = ladder[middle]
+            each = _measured(measured, recipe, folder)
             yield each
             if each.error * MARGIN > error:
                 halvings = math.log2(min(each.error, 1e6) * MARGIN / error)
@@ -276,6 +252,14 @@ def _considered(sample: Sample, alone: Sample | None, folder: pathlib.Path | Non
             most = min(most, each.nbytes if fast else _SLOW * each.nbytes)
             if fast and least[0] > (1 - _SAVING) * each.nbytes:
                 break
+
+
+def _ladder(recipe: Recipe, sample: Sample, alone: Sample | None) -> list[tuple[Recipe, Sample]]:
+    """The steps of a recipe, each with the sample whose BRDF it takes: that of the group, or of its only part alone."""
+    table, steps = sample.shading.table, recipe.steps(sample.shading)
+    if recipe.joins and (table is None or recipe.takes(table)):
+        return [(step, sample) for step in steps if table is None or step.takes(table)]
+    return [] if alone is None else [(step, alone) for step in steps]
 
 
 def _measured(sample: Sample, recipe: Recipe, folder: pathlib.Path | None) -> Candidate:

@@ -1,12 +1,13 @@
 """Recipes: a system and its parameters, and the calls that precompute the system for one part of a scene."""
 
+import abc
 import dataclasses
 import functools
 import os
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,7 +28,7 @@ T = TypeVar("T")
 _HARMONIC_SIZE = 32  # edge of the visibility's faces in texels: enough for low degrees
 _STEPS = 4  # number of intervals of a harmonic table for each interval of a lobe table
 _VARYING = 0.02  # error of harmonic tables over roughness
-_DIFFUSE = 32  # factor on the number of single texels of Lambertian parts
+_MATTE_TEXELS = 32  # factor on the number of single texels of Lambertian parts
 _PAIRS = 256  # pairs of directions at which BRDFs are tried
 
 
@@ -89,31 +90,56 @@ class Target:
         return {"occluder": self.occluder, "vertex": self.vertex}
 
 
-@runtime_checkable
-class Recipe(Protocol):
+class Recipe(eqx.Module):
     """The parameters of a system, and the method that precomputes it for parts of one kind.
 
+    A system of another package has a recipe too: a subclass with `make`, and with what else differs from here.
+
     Attributes:
-        joins: Whether parts with one BRDF share a system.
+        joins: Whether parts with one BRDF share a system. Otherwise each part has a system for its BRDF alone.
+        classes: Further data classes of another package that files of its systems and recipes hold.
     """
 
-    joins: ClassVar[bool]
+    joins: ClassVar[bool] = True
+    classes: ClassVar[tuple[type, ...]] = ()
+
+    @abc.abstractmethod
+    def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
+        """Precomputes the system of all vertices of the shading's mesh, padded to a number of vertices.
+
+        Args:
+            shading: The parts as one mesh, with their BRDF.
+            target: Occluders, and where and how to compute.
+            vertices: Number of vertices of the result, of which those after the mesh's repeat the last one; None for
+                the mesh's. `jaxprt.relit.recipes.padded` pads transport.
+        """
 
     def takes(self, table: StandardTable) -> bool:
         """Whether the system reads a standard table; otherwise parts have BRDFs of their own."""
-        ...
+        return False
 
-    def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
-        """Precomputes the system of all vertices of the shading's mesh, padded to a number of vertices."""
-        ...
+    def check(self, shading: Shading) -> None:
+        """Refuses a part that the system does not support, before rays are traced.
+
+        Raises:
+            ValueError: The system does not support the part.
+        """
+
+    def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
+        """Smallest number of bytes of the system for a number of vertices and an edge of the light's faces."""
+        return 0
+
+    def steps(self, shading: Shading) -> Sequence["Recipe"]:
+        """Recipes of increasing size that the planner tries for a part; none if it is not to try any."""
+        return (self,)
 
 
-def _padded(transport: T, vertices: int | None) -> T:
+def padded(transport: T, vertices: int | None) -> T:
     """Transport padded to a number of vertices."""
     return transport if vertices is None else axes.joined([transport], size=vertices)
 
 
-class Lobes(eqx.Module):
+class Lobes(Recipe):
     """Recipe of the lobe system. The brightest texels of the light are summed exactly.
 
     Attributes:
@@ -121,8 +147,6 @@ class Lobes(eqx.Module):
         texels: Number of brightest texels that are summed one by one; 0 for none. A Lambertian part uses 32 times as
             many, because a texel costs it only about 1/30 as much; every bright light source then has a sharp shadow.
     """
-
-    joins: ClassVar = True
 
     lobes: int = 12
     texels: int = 16
@@ -133,10 +157,10 @@ class Lobes(eqx.Module):
 
     def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
         """Precomputes the system of all vertices of the shading's mesh, padded to a number of vertices."""
-        transport = _padded(_pyramid(shading.mesh, target), vertices)
+        transport = padded(_pyramid(shading.mesh, target), vertices)
         if shading.matte:
             matte = lobe.MatteSystem(lobe.matte_transport(transport), shading.albedo)
-            return _bright(matte, lobe.texel_bits(transport), shading, _DIFFUSE * self.texels, transport.size)
+            return _bright(matte, lobe.texel_bits(transport), shading, _MATTE_TEXELS * self.texels, transport.size)
         table = lobe_table(shading, self.lobes)
         return _bright(lobe.LobeSystem(transport, table), transport, shading, self.texels, transport.size)
 
@@ -146,8 +170,12 @@ class Lobes(eqx.Module):
             return vertices * (6 * size**2 // 8 + diffuse.count(size))
         return vertices * (pyramid.scales(size).total + diffuse.count(size))
 
+    def steps(self, shading: Shading) -> Sequence[Recipe]:
+        """More lobes and texels from step to step; none for a Lambertian part, for which harmonics take fewer bytes."""
+        return () if shading.matte else _LOBES
 
-class Harmonics(eqx.Module):
+
+class Harmonics(Recipe):
     """Recipe of the harmonic system: transfer vectors for Lambertian parts, transfer matrices for all others.
 
     The system named "harmonic" is `Harmonics(laplacian=0.4)`. Visibility is traced at no more than 6 x 32 x 32 texels.
@@ -157,8 +185,6 @@ class Harmonics(eqx.Module):
         laplacian: Fraction of the light's squared Laplacian that windowing keeps, to reduce ringing. 1 means no window.
             Not used for Lambertian parts.
     """
-
-    joins: ClassVar = True
 
     degree: int = 4
     laplacian: float = 1.0
@@ -174,7 +200,7 @@ class Harmonics(eqx.Module):
         store = f"{'vectors' if matte else 'matrices'}_{self.degree}"
         size, options = min(target.size, _HARMONIC_SIZE), target.traced() | target.options(store)
         whole: Any = trace(shading.mesh, degree=self.degree, size=size, apart=True, **options)
-        transport = _padded(whole, vertices)
+        transport = padded(whole, vertices)
         if shading.matte:
             return harmonic.DiffuseSystem(transport, shading.albedo)
         return harmonic.HarmonicSystem(transport, harmonic_table(shading, degree=self.degree), self.laplacian)
@@ -184,8 +210,27 @@ class Harmonics(eqx.Module):
         terms = (self.degree + 1) ** 2
         return 4 * vertices * (terms if shading.matte else terms**2)
 
+    def steps(self, shading: Shading) -> Sequence[Recipe]:
+        """Higher degrees from step to step."""
+        return _DIFFUSE if shading.matte else _HARMONIC
 
-class Terms(eqx.Module):
+
+class _OneBrdf(Recipe):
+    """A recipe that factors a single BRDF."""
+
+    joins: ClassVar = False
+
+    def check(self, shading: Shading) -> None:
+        """Refuses a part whose roughness varies."""
+        if shading.knot:
+            low, high = np.exp([shading.knot[0][0], shading.knot[0][-1]])
+            raise ValueError(
+                f"the separable system must have one roughness for all vertices, got a texture from {low:.2f} to "
+                f"{high:.2f}: use the lobe or the harmonic system"
+            )
+
+
+class Terms(_OneBrdf):
     """Recipe of the separable system with sparse wavelet transport.
 
     Attributes:
@@ -194,15 +239,9 @@ class Terms(eqx.Module):
         resolution: Edge of the maps of the terms in texels.
     """
 
-    joins: ClassVar = False
-
     terms: int = 4
     keep: int = 96
     resolution: int = 48
-
-    def takes(self, table: StandardTable) -> bool:
-        """Never: one BRDF is factored."""
-        return False
 
     def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
         """Precomputes the system of a part."""
@@ -213,8 +252,12 @@ class Terms(eqx.Module):
         options = {"keep": keep, "size": target.size, **target.traced(), **target.options("separable")}
         return separable.SeparableSystem(separable.precompute(shading.mesh, factored, **options), factored)
 
+    def steps(self, shading: Shading) -> Sequence[Recipe]:
+        """Those of the system that is compressed over clusters."""
+        return () if shading.matte else _CLUSTERS
 
-class Clusters(eqx.Module):
+
+class Clusters(_OneBrdf):
     """Recipe of the separable system, compressed over clusters of vertices. The brightest texels are summed exactly.
 
     Attributes:
@@ -227,8 +270,6 @@ class Clusters(eqx.Module):
         members: Approximate number of vertices of a cluster.
     """
 
-    joins: ClassVar = False
-
     terms: int = 32
     resolution: int = 64
     components: int = 16
@@ -236,10 +277,6 @@ class Clusters(eqx.Module):
     keep: int = 768
     texels: int = 16
     members: int = 225
-
-    def takes(self, table: StandardTable) -> bool:
-        """Never: one BRDF is factored."""
-        return False
 
     def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
         """Precomputes the system of a part."""
@@ -273,7 +310,7 @@ class Clusters(eqx.Module):
         return clusters, terms, {"components": components, "modes": modes, "keep": keep}
 
 
-class Dynamic(eqx.Module):
+class Dynamic(Recipe):
     """Recipe of the dynamic system: lobes, and a tensor for what they leave. The brightest texels are summed exactly.
 
     A Lambertian part has the system of `Lobes`.
@@ -287,8 +324,6 @@ class Dynamic(eqx.Module):
         keep: Number of wavelet coefficients of each cluster.
         texels: Number of brightest texels that are summed one by one.
     """
-
-    joins: ClassVar = True
 
     lobes: int = 12
     ranks: tuple[int, int, int] | None = eqx.field(default=standard.RANKS, converter=lambda x: x and tuple(x))
@@ -327,7 +362,7 @@ class Dynamic(eqx.Module):
         sizes = {"components": self.components, "modes": self.modes, "keep": self.keep}
         name = "" if self.ranks is None else "_" + "_".join(map(str, (self.lobes, *self.ranks)))
         options = {**sizes, **target.options(f"dynamic{name}")}
-        transport = _padded(dynamic.compress(known.visible, brdf, pyramid=known.pyramid, **options), vertices)
+        transport = padded(dynamic.compress(known.visible, brdf, pyramid=known.pyramid, **options), vertices)
         return _bright(dynamic.DynamicSystem(transport, brdf), transport.pyramid, shading, self.texels, target.size)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
@@ -341,13 +376,30 @@ class Dynamic(eqx.Module):
         seen = pyramid.scales(size).total + diffuse.count(size)
         return vertices * (seen + 4 * most["components"]) + shared
 
+    def steps(self, shading: Shading) -> Sequence[Recipe]:
+        """None: the planner chooses among systems of fewer bytes."""
+        return ()
 
-SYSTEMS: dict[str, Recipe] = {
-    "dynamic": Dynamic(),
-    "harmonic": Harmonics(laplacian=0.4),
-    "lobe": Lobes(),
-    "separable": Terms(),
-}
+
+# What the planner tries, by increasing size. The parameters of each step contribute errors of similar size.
+_DIFFUSE = tuple(Harmonics(degree=degree) for degree in (2, 3, 4, 6, 8))
+_HARMONIC = tuple(Harmonics(degree=degree) for degree in (2, 3, 4))
+_LOBES = tuple(Lobes(*step) for step in ((2, 4), (4, 8), (8, 16), (12, 16), (16, 32), (24, 64)))
+_CLUSTERS = tuple(
+    Clusters(*step)
+    for step in (
+        (2, 64, 4, 8, 192, 2),
+        (4, 64, 8, 24, 256, 4),
+        (8, 64, 8, 32, 384, 4),
+        (16, 64, 12, 48, 512, 8),
+        (32, 64, 16, 80, 768, 16),
+        (48, 64, 16, 96, 1024, 16),
+        (64, 64, 24, 128, 1024, 32),
+        (96, 96, 32, 192, 1536, 64),
+        (128, 96, 48, 256, 1536, 64),
+        (192, 96, 64, 384, 2048, 128),
+    )
+)
 
 
 def _pyramid(mesh: Mesh, target: Target) -> LobeTransport:
@@ -411,17 +463,12 @@ def check(recipe: Recipe, shading: Shading) -> None:
     """Refuses a part that a recipe does not support.
 
     Raises:
-        ValueError: The roughness of the part varies, but the recipe factors a single BRDF; or the part has a BRDF that
-            returns values that are negative, not finite, or without an axis of colors.
+        ValueError: The recipe refuses the part, or the part has a BRDF that returns values that are negative, not
+            finite, or without an axis of colors.
     """
     if shading.blend is None:
         _check_values(shading.exact)
-    if shading.knot and isinstance(recipe, Terms | Clusters):
-        low, high = np.exp([shading.knot[0][0], shading.knot[0][-1]])
-        raise ValueError(
-            f"the separable system must have one roughness for all vertices, got a texture from {low:.2f} to "
-            f"{high:.2f}: use the lobe or the harmonic system"
-        )
+    recipe.check(shading)
 
 
 def _check_values(brdf: Callable) -> None:

@@ -7,6 +7,7 @@ import pytest
 import jaxprt as prt
 from jaxprt.brdf import measured
 from jaxprt.cli import inputs
+from jaxprt.relit import registry
 
 WI, WO = np.array([[0.6, 0.0, 0.8], [0.0, 0.28, 0.96]]), np.array([[-0.36, 0.48, 0.8], [0.0, -0.28, 0.96]])
 PAIR = jnp.asarray(WI, jnp.float32), jnp.asarray(WO, jnp.float32)
@@ -50,7 +51,7 @@ def test_every_model_of_the_package_has_a_name_and_the_material_of_gltf_can_chan
     models = {
         each for each in vars(prt.brdf).values() if isinstance(each, type) and issubclass(each, prt.brdf.models.Model)
     }
-    named = {*inputs.MODELS.values(), prt.brdf.MetallicRoughness, prt.brdf.SchlickDiffuse}
+    named = {*registry.MATERIALS.values(), prt.brdf.MetallicRoughness, prt.brdf.SchlickDiffuse}
     assert models <= named
     made = inputs.parse("metallic-roughness:base_color=.9/.6/.2,metallic=0,roughness=.3")
     assert isinstance(made, prt.scene.TexturedMaterial)

@@ -13,7 +13,7 @@ import pytest
 import jaxprt as prt
 from jaxprt import lobe, reference
 from jaxprt.brdf import AshikhminShirley, Lambert, Ward, WardDuer
-from jaxprt.relit import Clusters, Harmonics, Lobes, reflection
+from jaxprt.relit import Clusters, Harmonics, Lobes, recipes, reflection
 from jaxprt.scene import Environment, TexturedMaterial, builtin
 from jaxprt.scene.material import Texture
 from jaxprt.scene.mesh import ground_plane, make_mesh
@@ -30,10 +30,10 @@ VIEWS = jnp.array([[0.5, 3.0, 1.0], [-2.0, 0.5, 2.5]])
 def small(coarse, bound):
     """Few steps and small maps."""
     with pytest.MonkeyPatch.context() as patch:
-        terms = tuple(Clusters(step.terms, 12, *list(vars(step).values())[2:]) for step in planning._TERMS[:3])
-        patch.setattr(planning, "_TERMS", terms)
-        patch.setattr(planning, "_LOBES", planning._LOBES[:2])
-        patch.setattr(planning, "_HARMONIC", (Harmonics(degree=2),))
+        terms = tuple(Clusters(step.terms, 12, *list(vars(step).values())[2:]) for step in recipes._CLUSTERS[:3])
+        patch.setattr(recipes, "_CLUSTERS", terms)
+        patch.setattr(recipes, "_LOBES", recipes._LOBES[:2])
+        patch.setattr(recipes, "_HARMONIC", (Harmonics(degree=2),))
         patch.setattr(lobe.table, "_natural_error", lambda brdf, table: 0.0)  # No plan reads it.
         bound(patch, lobe.tabulate, resolution=8)
         patch.setattr(measuring, "_PICTURE", 32)

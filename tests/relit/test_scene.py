@@ -20,7 +20,7 @@ from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.image import automatic_exposure, raster, sky
 from jaxprt.relit import Clusters, Dynamic, Harmonics, Lobes, RelitScene, Terms, measuring, refinement, reflection
 from jaxprt.relit.channels import of_part
-from jaxprt.relit.recipes import SYSTEMS
+from jaxprt.relit.registry import SYSTEMS
 from jaxprt.scene import Camera, Environment, Mesh, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.camera import orbit
 from jaxprt.scene.environment import background, environment_from_image
