@@ -133,14 +133,13 @@ def precompute(
     targets = [Target(mesh, path=folder and folder / name, **options) for name in names]
     systems = _systems(recipes, shadings, targets, place)
     lit = lamps.make(near, shadings, place, systems, targets, scene.point_lights)
-    reflected = lobes = None
+    reflected = None
     if bounces:
         # One store serves any number of bounces: a larger number resumes from a smaller one.
         target = Target(mesh, path=folder and folder / "scene", **options)
         lamp = lit and lit.transport(place)
-        reflected = reflection.make(shadings, place, bounces, target, lamp=lamp)
-        lobes = reflection.lobes(shadings, place, systems) if rays else None
-    given = {"lamps": lit, "lobes": lobes, "rays": rays, "division": divided, "copied": copied}
+        reflected = reflection.make(shadings, place, bounces, target, lamp=lamp, systems=systems if rays else None)
+    given = {"lamps": lit, "rays": rays, "division": divided, "copied": copied}
     return RelitScene(scene, shadings, place, systems, reflected, **given)
 
 

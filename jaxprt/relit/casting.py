@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from jaxprt.scene import Mesh
 from jaxprt.scene.points import Points
-from jaxprt.systems.bounces.traced import Rays
+from jaxprt.systems.bounces.traced import ReflectionRays
 from jaxprt.visibility import Occluder, point_starts, start_points
 from jaxprt.visibility.rays import first_fronts
 
@@ -45,12 +45,12 @@ class Caster:
         return start_points(self.mesh, self.occluder)
 
     def cast(
-        self, rays: Rays, points: Points, *, at_vertices: bool
+        self, rays: ReflectionRays, points: Points, *, at_vertices: bool
     ) -> tuple[Int[np.ndarray, "j v"], Float[np.ndarray, "j v 3"], Float[np.ndarray, "v 3"]]:
         """The triangle that each ray hits (-1 for none), barycentric weights of the hit, and origins of the rays.
 
         Args:
-            rays: Rays that start from vertices or points.
+            rays: ReflectionRays that start from vertices or points.
             points: The points of the scene.
             at_vertices: Whether each point is the vertex that is its first corner.
         """
@@ -68,7 +68,7 @@ class Caster:
 
     def spread(
         self,
-        rays: Rays,
+        rays: ReflectionRays,
         triangle: Int[np.ndarray, "j v"],
         barycentric: Float[np.ndarray, "j v 3"],
         start: Float[np.ndarray, "v 3"],

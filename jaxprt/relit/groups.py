@@ -25,7 +25,6 @@ from jaxprt.scene.material_table import MaterialLook, MaterialTable
 from jaxprt.scene.mesh import frames, join
 from jaxprt.scene.points import Points
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart
-from jaxprt.systems.bounces.traced import SharpPart
 from jaxprt.systems.lamps import LitByLamps
 from jaxprt.systems.protocol import Blend, System
 
@@ -67,6 +66,18 @@ class Surface(eqx.Module):
     def matte(self) -> bool:
         """Whether the surface is ideally diffuse."""
         return self.system.matte
+
+    @property
+    def has_rays(self) -> bool:
+        """Whether rays represent the narrow lobes with which the surface reflects other surfaces."""
+        return self.reflecting is not None and self.reflecting.lobe is not None
+
+    @property
+    def without_rays(self) -> "Surface":
+        """The surface as rays see it: it reflects other surfaces by harmonics alone."""
+        if self.reflecting is None or self.reflecting.lobe is None:
+            return self
+        return dataclasses.replace(self, reflecting=self.reflecting.harmonics_alone)
 
     @property
     def channels(self) -> int:
@@ -279,7 +290,7 @@ class Stage(eqx.Module):
     @property
     def sharp_groups(self) -> list[int]:
         """Indices of the groups from which reflection rays start."""
-        return [number for number, group in enumerate(self.surfaces) if isinstance(group.reflecting, SharpPart)]
+        return [number for number, surface in enumerate(self.surfaces) if surface.has_rays]
 
     def sharp_at(self, number: int, points: Points) -> Float[Array, " p"] | None:
         """1 at points of the scene whose narrow lobes are traced, 0 at others; None for a group without rays."""

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxprt.brdf.varying import Channels
 from jaxprt.relit.channels import Shading
 from jaxprt.systems import bounces, harmonic, separable, standard
-from jaxprt.systems.bounces.varying import Sent
+from jaxprt.systems.bounces.varying import FunctionWeights
 from jaxprt.systems.standard import StandardTable
 
 _TERMS, _RESOLUTION = 24, 32  # number of terms, and edge of the maps, of BRDFs along light paths
@@ -40,7 +40,7 @@ class Path(NamedTuple):
     """
 
     brdf: separable.SeparableBrdf
-    sent: Sent | None
+    sent: FunctionWeights | None
 
 
 def factored(shading: Shading) -> Path:
@@ -84,7 +84,7 @@ def _factored(alone: Callable, brdf: Callable, knot: tuple[np.ndarray, ...]) -> 
     true = np.stack([channels(each) for each in members])
     factor *= np.where(kept > _DARK, true / np.maximum(kept, _DARK), 1)[..., None]
     dtype = shared.view_map.dtype
-    return Path(shared, Sent(tuple(jnp.asarray(each, dtype) for each in knot), jnp.asarray(factor, dtype)))
+    return Path(shared, FunctionWeights(tuple(jnp.asarray(each, dtype) for each in knot), jnp.asarray(factor, dtype)))
 
 
 def typical(shading: Shading, path: Path) -> Float[Array, "p c"] | None:

@@ -22,7 +22,7 @@ from jaxprt.relit.casting import caster
 from jaxprt.relit.groups import Arriving, Stage, Surface, look_at, sampled
 from jaxprt.relit.lamplight import LampLight
 from jaxprt.relit.shadows import TexelShares, TracedLight
-from jaxprt.relit.surface import Viewed, from_texels, lit, view
+from jaxprt.relit.surface import TexelLight, Viewed, radiance, view
 from jaxprt.relit.tracing import Reflections
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.points import Points
@@ -103,9 +103,8 @@ class PictureView(eqx.Module):
         recompute = not known(arriving, self.stage, self.camera)
         rows: list[tuple[Any, Array]] = []
         for row in self.rows:
-            color = _color(self, row, arriving, light, lamps, recompute=recompute)
-            if row.number in sharp:
-                color = color + next(reflected)
+            added = next(reflected) if row.number in sharp else None
+            color = _color(self, row, arriving, light, lamps, added, recompute=recompute)
             rows.append((row.index, finished(color, between)))
             colors = max(colors, color.shape[-1])
         picture = canvas.sky(environment, self.camera, self.ray, self.pixels.background, colors=colors)
@@ -138,6 +137,7 @@ def _color(
     arriving: Arriving,
     light: TracedLight | None,
     lamps: LampLight | None,
+    reflections: Float[Array, "p c"] | None,
     *,
     recompute: bool,
 ) -> Float[Array, "*m p c"]:
@@ -149,15 +149,17 @@ def _color(
         arriving: The light that arrives at the scene, without what is taken out of traced texels.
         light: The light with its traced texels; None without.
         lamps: The lamps, if rays are traced to them.
+        reflections: What reflection rays add; None without.
         recompute: Whether derivatives compute again what depends on the view, which needs less memory.
     """
     surface = sampled(picture.stage.surfaces[row.number], row.samples)
     if row.index.ndim == 2:  # of a view that was made inside of `jax.jit`
         return _color_of_some(picture, row, arriving, light)
     if isinstance(row.kept, Viewed):
-        return _lit(surface, row.samples, arriving.at(row.number), light, row.index, row.kept)
+        texels = _texels(row, light, row.index)
+        return radiance(surface, arriving.at(row.number), row.kept, texels=texels, reflections=reflections)
     shade = partial(_shaded, picture, surface, row, row.index, lamps)
-    return (jax.checkpoint(shade) if recompute else shade)(arriving, light)
+    return (jax.checkpoint(shade) if recompute else shade)(arriving, light, reflections)
 
 
 def _shaded(
@@ -168,25 +170,18 @@ def _shaded(
     lamps: LampLight | None,
     arriving: Arriving,
     light: TracedLight | None,
+    reflections: Float[Array, "p c"] | None = None,
 ) -> Float[Array, "p c"]:
     points, on_group = _points(picture, index)
     transport = None if lamps is None else lamps.row(row.number, index, on_group)
     seen = _seen(picture.stage, surface, row.number, points, on_group, picture.camera, lamps=transport)
-    return _lit(surface, row.samples, arriving.at(row.number), light, index, seen)
+    texels = _texels(row, light, index)
+    return radiance(surface, arriving.at(row.number), seen, texels=texels, reflections=reflections)
 
 
-def _lit(
-    surface: Surface, samples: int, arriving: tuple, light: TracedLight | None, index: Any, seen: Viewed
-) -> Float[Array, "p c"]:
-    """Colors of points at which radiance is computed."""
-    color = lit(surface, arriving, seen)
-    return color if light is None else color + _from_texels(surface, samples, seen, light, index)
-
-
-def _from_texels(surface: Surface, samples: int, seen: Viewed, light: TracedLight, index: Any) -> Float[Array, "p c"]:
-    """Radiance that points reflect from the traced texels of the light."""
-    size = light.rest.radiance.shape[-2]
-    return from_texels(surface, seen.sight, *light.row(index), size=size, samples=samples)
+def _texels(row: Row, light: TracedLight | None, index: Any) -> TexelLight | None:
+    """The traced texels of the light at points of a row; None without."""
+    return None if light is None else TexelLight(*light.row(index), light.rest.radiance.shape[-2], row.samples)
 
 
 def _color_of_some(
@@ -256,7 +251,7 @@ def make(
             if row.number in sharp:
                 blend, own = stage.blend(row.number, points, on_group)
                 narrow = stage.sharp_at(row.number, points)
-                origins.append(tracing.Asked(row.number, points, own, blend, narrow, transport))
+                origins.append(tracing.RayOrigins(row.number, points, own, blend, narrow, transport))
         complete.append(row)
     reflected = tracing.trace(stage, origins, jnp.asarray(camera.eye), keep=keep) if origins else None
     ray = raster.ray_direction(camera)

@@ -54,6 +54,7 @@ def make(
     target: Target,
     *,
     lamp: LampTransport | None = None,
+    systems: Sequence[System] | None = None,
 ) -> GroupBounces:
     """Precomputes the light of the environment and of lamps that all parts reflect onto each other and themselves.
 
@@ -66,6 +67,8 @@ def make(
         count: Number of bounces, at least 1; or "all".
         target: Size of the light, and where and how to compute. All parts occlude each other, and all vertices are lit.
         lamp: Transport of the lamps to the vertices of all parts; None without lamps.
+        systems: The systems of the groups for direct light, whose tables of lobes are used where rays represent lobes
+            that are too sharp for harmonics; None to reflect by harmonics alone.
 
     Returns:
         The system of reflected light alone.
@@ -86,12 +89,13 @@ def make(
     )
     groups = []
     for number, (shading, path) in enumerate(zip(first, of_group, strict=True)):
-        own = [shadings[part].mesh for part in place.parts[number]]
-        frame = [frames(mesh.normal, mesh.tangent) for mesh in own]
-        position = place.column(number, [mesh.position for mesh in own])
+        parts = [shadings[part] for part in place.parts[number]]
+        frame = [frames(part.mesh.normal, part.mesh.tangent) for part in parts]
+        position = place.column(number, [part.mesh.position for part in parts])
         table = harmonic_table(shading, degree=DEGREE)
         position, axes = jax.device_put((position, place.column(number, frame)))
-        groups.append(ReflectingPart(position, axes, table, sent=path.sent))
+        lobe = None if systems is None else _lobes(parts, systems[number])
+        groups.append(ReflectingPart(position, axes, table, sent=path.sent, lobe=lobe))
     return GroupBounces.make(tensor, groups, [place.vertices(number) for number in range(len(groups))])
 
 
@@ -128,24 +132,12 @@ def _stacked(weights: Sequence[Array | None]) -> Float[np.ndarray, "n p c"]:
     return np.stack(np.broadcast_arrays(*map(np.asarray, weights)))
 
 
-def lobes(shadings: Sequence[Shading], place: Place, systems: Sequence[System]) -> list[LobeBrdf | None]:
-    """For each group, its BRDF as lobes if some of its parts are sharp, or may become so; None for other groups.
-
-    Args:
-        shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
-        place: Where the vertices of the parts stand in their groups.
-        systems: The systems of the groups. If one has a table of lobes, it is used.
-    """
-    result: list[LobeBrdf | None] = []
-    for own, system in zip(place.parts, systems, strict=True):
-        shading = shadings[own[0]]
-        if shading.matte:
-            result.append(None)
-            continue
-        table = system.lobe_table or lobe_table(shading, _LOBES)
-        may = shading.table is not None or any(is_sharp(shadings[part], table) for part in own)
-        result.append(table if may else None)
-    return result
+def _lobes(shadings: Sequence[Shading], system: System) -> LobeBrdf | None:
+    """The BRDF of a group as lobes if some of its parts are sharp, or may become so; None for other groups."""
+    if shadings[0].matte:
+        return None
+    table = system.lobe_table or lobe_table(shadings[0], _LOBES)
+    return table if shadings[0].table is not None or any(is_sharp(part, table) for part in shadings) else None
 
 
 def is_sharp(shading: Shading, table: LobeBrdf | None) -> bool:

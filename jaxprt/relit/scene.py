@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxprt import require
 from jaxprt.brdf import grid
@@ -25,7 +25,7 @@ from jaxprt.relit.lamps import SceneLamps
 from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.recipes import samples_of
 from jaxprt.relit.refinement import MeshDivision
-from jaxprt.relit.surface import combine, view_of
+from jaxprt.relit.surface import Viewed, radiance, view_of
 from jaxprt.relit.tracing import Reflections
 from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial, material_table, sides, subdivision
 from jaxprt.scene import mesh as meshes
@@ -35,8 +35,6 @@ from jaxprt.scene.material_table import MaterialTable
 from jaxprt.scene.points import Points
 from jaxprt.systems import axes, protocol
 from jaxprt.systems.bounces import GroupBounces
-from jaxprt.systems.bounces.traced import SharpPart
-from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.protocol import Blend, System
 
 _TEXELS = 64  # edge of the light's faces for which samples of traced texels are chosen, for systems of any size
@@ -47,16 +45,12 @@ class SceneView(eqx.Module):
     """What depends on the view and the materials of a scene.
 
     Attributes:
-        group: For each group, the view of direct light, of reflected light and of lamps.
-        emitted: Radiance that each vertex of each group emits; None for a group that does not emit.
-        points: Points on each group at which radiance is evaluated; None for its vertices.
+        group: The vertices of each group, or points on it.
         stage: The scene and its materials.
         reflected: Reflections that sharp parts show by ray tracing; None without.
     """
 
-    group: tuple[tuple[PyTree, PyTree, PyTree], ...]
-    emitted: tuple[Float[Array | np.ndarray, "_ 3"] | None, ...]
-    points: tuple[Points | None, ...]
+    group: tuple[Viewed, ...]
     stage: Stage
     reflected: Reflections | None = None
 
@@ -85,7 +79,6 @@ class RelitScene(System):
             Cameras, eyes and point lights are in the coordinates of the scene's file.
         curvature: How fast the radiance of each part varies with direction, from
             `jaxprt.relit.curvature.of_part`.
-        lobes: BRDF, as lobes, of each group with parts whose reflections are too sharp for harmonics; None for others.
         points: Points on each part at which radiance is computed; None for the vertices.
         samples: Number of sample points along the edge of each bright texel, for each part.
         sharp: Whether reflections of each part are traced.
@@ -106,7 +99,6 @@ class RelitScene(System):
     table: MaterialTable
     camera: Camera
     curvature: Float[np.ndarray | Array, " n"]
-    lobes: tuple[LobeBrdf | None, ...]
     points: tuple[Points, ...] | None
     samples: tuple[int, ...] = eqx.field(static=True)
     sharp: tuple[bool, ...] = eqx.field(static=True)
@@ -123,7 +115,6 @@ class RelitScene(System):
         bounces: GroupBounces | None = None,
         *,
         lamps: SceneLamps | None = None,
-        lobes: Sequence[LobeBrdf | None] | None = None,
         rays: int = RAYS,
         division: MeshDivision | None = None,
         copied: Sequence[Int[np.ndarray, " _"]] | None = None,
@@ -137,7 +128,6 @@ class RelitScene(System):
             systems: The system of each group for direct light.
             bounces: The system of light that the parts reflect onto each other; None without bounces.
             lamps: Emitting parts and point lights, precomputed; None without.
-            lobes: BRDF, as lobes, of each group with sharp parts, and None for other groups. None if no part is sharp.
             rays: Number of reflection rays that each vertex or point of a sharp part sends; 0 reflects by harmonics
                 alone.
             division: How the meshes of the scene were divided; None if they were not.
@@ -157,7 +147,6 @@ class RelitScene(System):
         self.shading, self.place, self.bounces, self.lamps = tuple(shading), place, bounces, lamps
         self.mesh, self.points, self.rays = scene.mesh, None, rays
         self.drawn = groups.padded(self.mesh)
-        self.lobes = tuple(None for _ in systems) if lobes is None else tuple(lobes)
         self.table = jax.device_put(material_table.of_parts(self.scene.parts))
         first = [_precomputed(part) for part in shading]
         self.appearance = tuple(jax.device_put(place.gathered(number, first)) for number in range(len(systems)))
@@ -173,8 +162,7 @@ class RelitScene(System):
             for number, system in enumerate(systems)
         )
         pairs = zip(shading, place.group, strict=True)
-        found = [traits(each, systems[number], self.lobes[number]) for each, number in pairs]
-        curvature, samples, sharp = zip(*found, strict=True)
+        curvature, samples, sharp = zip(*(traits(part, self.surfaces[number]) for part, number in pairs), strict=True)
         self.curvature, self.samples, self.sharp = np.asarray(curvature, self.mesh.position.dtype), samples, sharp
         self.camera = scenes.default_camera(scene, self.mesh)
 
@@ -202,7 +190,7 @@ class RelitScene(System):
     def without_bounces(self) -> "RelitScene":
         """The scene without light that its parts reflect onto each other."""
         surfaces = tuple(dataclasses.replace(own, reflecting=None) for own in self.surfaces)
-        return self._replaced(surfaces=surfaces, bounces=None, lobes=tuple(None for _ in surfaces))
+        return self._replaced(surfaces=surfaces, bounces=None)
 
     def _replaced(self, **fields: Any) -> "RelitScene":
         """A copy with other fields. Works inside `jax.jit` too, where `__init__` could not measure the curvature."""
@@ -249,7 +237,7 @@ class RelitScene(System):
         given = scene_lamps.split(self.lamps, materials)[0]
         appearances = self.appearances(given)
         stage, every = self._stage(given, appearances), self._gathered(appearances)
-        views, emitted, asked, places = [], [], [], []
+        views, starts = [], []
         for number, (surface, own) in enumerate(zip(stage.surfaces, every, strict=True)):
             points, place = self._points(number, stage)
             blend = own.blend if place is None or own.blend is None else jax.tree.map(place.carry, own.blend)
@@ -260,13 +248,11 @@ class RelitScene(System):
                 if self.points is None:
                     with compile_time(self.mesh, eye):
                         sharp = sharp * tracing.facing(self.mesh, eye)[points.corner[0]] * self._real(number)
-                asked.append(tracing.Asked(number, points, place, blend, sharp, at_vertices=self.points is None))
-            views.append(view_of(surface, eye, blend, place, sharp))
-            places.append(place)
-            glow = own.emitted
-            emitted.append(glow if glow is None or place is None else place.carry(glow))
-        reflected = tracing.trace(stage, asked, eye, keep=True) if asked else None
-        return SceneView(tuple(views), tuple(emitted), tuple(places), stage, reflected)
+                starts.append(tracing.RayOrigins(number, points, place, blend, sharp, at_vertices=self.points is None))
+            emitted = own.emitted if place is None or own.emitted is None else place.carry(own.emitted)
+            views.append(Viewed(place, view_of(surface, eye, blend, place, sharp), emitted))
+        reflected = tracing.trace(stage, starts, eye, keep=True) if starts else None
+        return SceneView(tuple(views), stage, reflected)
 
     @promoted
     def combine(self, light: Arriving | SceneLight, view: SceneView) -> Float[Array, "v c"]:
@@ -278,11 +264,10 @@ class RelitScene(System):
         assert isinstance(light, Arriving)
         traced = iter(()) if view.reflected is None else iter(view.reflected.radiance(view.stage, light))
         colors = []
-        groups_of = zip(self.surfaces, view.group, view.emitted, view.points, strict=True)
-        for number, (surface, seen, emitted, points) in enumerate(groups_of):
+        for number, (surface, viewed) in enumerate(zip(self.surfaces, view.group, strict=True)):
             surface = groups.sampled(surface, max(view.stage.samples[part] for part in self.place.parts[number]))
-            color = combine(surface, light.at(number), seen, points, emitted)
-            colors.append(color + next(traced) if number in view.stage.sharp_groups else color)
+            reflections = next(traced) if number in view.stage.sharp_groups else None
+            colors.append(radiance(surface, light.at(number), viewed, reflections=reflections))
         return groups.ordered(tuple(colors), self._order())
 
     def _points(self, number: int, stage: Stage) -> tuple[Points, Points | None]:
@@ -390,20 +375,16 @@ class RelitScene(System):
             if given.blend is not None and shading.table is not None and known(given):
                 number = self.place.group[part]
                 new = dataclasses.replace(shading, blend=given.blend)
-                rows[part] = traits(new, self.surfaces[number].system, self.lobes[number])
+                rows[part] = traits(new, self.surfaces[number])
         bend, samples, sharp = zip(*rows, strict=True)
         return list(bend), samples, sharp
 
     def _surface(self, number: int, sharp: Sequence[bool]) -> Surface:
         """A group, with rays for its reflections if any of its parts is sharp."""
-        surface, lobes = self.surfaces[number], self.lobes[number]
-        if surface.reflecting is None or lobes is None or not self.rays:
-            return surface
-        if not any(sharp[part] for part in self.place.parts[number]):
-            return surface
-        part = surface.reflecting
-        ray = SharpPart(part.position, part.frame, part.brdf, lobes, self.rays, sent=part.sent)
-        return dataclasses.replace(surface, reflecting=ray)
+        surface = self.surfaces[number]
+        if surface.reflecting is None or not self.rays or not any(sharp[part] for part in self.place.parts[number]):
+            return surface.without_rays
+        return dataclasses.replace(surface, reflecting=dataclasses.replace(surface.reflecting, count=self.rays))
 
     def _given(self, number: int, fixed: Sequence[bool], appearances: Sequence[Appearance]) -> Given | None:
         """Materials that users give at the vertices of some parts of a group; None without."""
@@ -693,7 +674,7 @@ class RelitScene(System):
     @property
     def nbytes(self) -> int:
         """Bytes of the systems of all groups, bounces and lamps: transport and BRDFs. Shared arrays count once."""
-        held = self.surfaces, self.bounces, self.lobes
+        held = self.surfaces, self.bounces
         return sum({id(leaf): leaf.nbytes for leaf in jax.tree.leaves(held)}.values())
 
     def part_system(self, part: int) -> System:
@@ -747,15 +728,15 @@ class _Lit(eqx.Module):
         return self.scene.shade(light, {**self.appearances, **lights})
 
 
-def traits(shading: Shading, system: System, lobes: LobeBrdf | None) -> tuple[float, int, bool]:
+def traits(shading: Shading, surface: Surface) -> tuple[float, int, bool]:
     """Curvature of a part's radiance, samples of bright texels, and whether its reflections are traced.
 
     Args:
         shading: The part with its material.
-        system: The system of its group.
-        lobes: The BRDF of the group as lobes; None if nothing is traced.
+        surface: Its group.
     """
-    size = system.texel_edge or _TEXELS
+    size = surface.system.texel_edge or _TEXELS
     # Powers of two, so that few programs are compiled for parts of different roughness.
     samples = 1 << (samples_of(shading, size) - 1).bit_length()
-    return curvature.of_part(shading, system), samples, reflection.is_sharp(shading, lobes)
+    lobes = None if surface.reflecting is None else surface.reflecting.lobe
+    return curvature.of_part(shading, surface.system), samples, reflection.is_sharp(shading, lobes)

@@ -1,12 +1,15 @@
-"""Shading of rows of points: radiance from direct light, reflected light and lamps together.
+"""Shading of rows of points or vertices: all light that they send to the eye.
 
-`view` computes all that does not depend on the light, and `lit` the rest. Both are one program for each kind of group.
+`view` computes all that does not depend on the light, and `radiance` is the one sum of direct light, reflected light,
+lamps and emission. Both are one program for each kind of group.
 """
 
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, PyTree, UInt8
 
 from jaxprt.compile import jit, kept
@@ -15,7 +18,6 @@ from jaxprt.scene.material_table import MaterialLook
 from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import directions
 from jaxprt.systems import bright_texels
-from jaxprt.systems.bounces.traced import SharpPart
 from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.lobe import widened
 from jaxprt.systems.protocol import Blend
@@ -43,16 +45,36 @@ class Viewed(eqx.Module):
     """Points of a group with all that does not depend on the light.
 
     Attributes:
-        points: The points on the group.
+        points: The points on the group; None for its vertices.
         seen: The view of each system of the group: direct light, reflected light and lamps.
-        emitted: Radiance that the points emit.
-        sight: What single texels of the light need.
+        emitted: Radiance that the points emit; None for a group that does not emit.
+        sight: What single texels of the light need; None where they are not summed one by one.
     """
 
-    points: Points
+    points: Points | None
     seen: tuple[PyTree, PyTree, PyTree]
-    emitted: Float[Array, "p 3"]
-    sight: Sight
+    emitted: Float[Array | np.ndarray, "p 3"] | None
+    sight: Sight | None = None
+
+
+class TexelLight(NamedTuple):
+    """Light of single texels at some points.
+
+    Attributes:
+        texel: Indices of the texels.
+        excess: Their radiance.
+        share: Share of each texel that each point sees, in 255ths.
+        place: Where in each texel its light comes from.
+        size: Edge of the cubemap faces in texels.
+        samples: Number of sample points along the edge of each texel.
+    """
+
+    texel: Int[Array, " t"]
+    excess: Float[Array, "t c"]
+    share: UInt8[Array, "t p"]
+    place: Float[Array, "t 4"]
+    size: int
+    samples: int
 
 
 @partial(kept, static=("glows",))
@@ -89,20 +111,33 @@ def view(
     return Viewed(points, seen, emitted if glows else jnp.zeros_like(emitted), sight)
 
 
-@kept
-def lit(surface: Surface, arriving: tuple[PyTree, PyTree, PyTree], viewed: Viewed) -> Float[Array, "p c"]:
-    """Colors of some points from the light that arrives at their group.
+def radiance(
+    surface: Surface,
+    arriving: tuple[PyTree, PyTree, PyTree],
+    viewed: Viewed,
+    *,
+    texels: TexelLight | None = None,
+    reflections: Float[Array, "p c"] | None = None,
+) -> Float[Array, "p _"]:
+    """Radiance that points of a group send to the eye: the sum of all light of a scene.
 
     Args:
         surface: The group.
         arriving: Direct light, reflected light, and radiance of each lamp.
         viewed: The result of `view`.
+        texels: Direct light of texels that are not in `arriving`; None without.
+        reflections: What reflection rays add; None without.
     """
-    return combine(surface, arriving, viewed.seen, viewed.points, viewed.emitted)
+    color = _lit(surface, arriving, viewed.seen, viewed.points, viewed.emitted)
+    if texels is not None:
+        assert viewed.sight is not None
+        *rows, size, samples = texels
+        color = color + _from_texels(surface, viewed.sight, *rows, size=size, samples=samples)
+    return color if reflections is None else color + reflections
 
 
 @partial(kept, static=("size", "samples"))
-def from_texels(
+def _from_texels(
     surface: Surface,
     sight: Sight,
     texel: Int[Array, " t"],
@@ -113,18 +148,7 @@ def from_texels(
     size: int,
     samples: int,
 ) -> Float[Array, "p c"]:
-    """Radiance that points reflect from single texels of the light.
-
-    Args:
-        surface: The group.
-        sight: The points.
-        texel: Indices of the texels.
-        excess: Their radiance.
-        share: Share of each texel that each point sees, in 255ths.
-        place: Where in each texel its light comes from.
-        size: Edge of the cubemap faces in texels.
-        samples: Number of sample points along the edge of each texel.
-    """
+    """Radiance that points reflect from single texels of the light."""
     light = texel, excess / picture_rays.FULL, share
     options = {"size": size, "samples": samples, "place": place}
     return bright_texels.sent(
@@ -162,10 +186,8 @@ def view_of(
     """
     system, reflecting = surface.system if points is None else surface.system.at(points), surface.reflecting
     reflected = None
-    if isinstance(reflecting, SharpPart):
+    if reflecting is not None:
         reflected = reflecting.view(eye, blend, points, sharp)
-    elif reflecting is not None:
-        reflected = reflecting.view(eye, blend, points)
     lit = None
     if lamps is not None:
         lit = _lit_at(surface, points, lamps, eye, blend, sharp)
@@ -187,23 +209,15 @@ def _lit_at(
     return surface.lit.at(lamps).view(eye, blend, None, sharp)
 
 
-@jit
-def combine(
+@kept
+def _lit(
     surface: Surface,
     arriving: tuple[PyTree, PyTree, PyTree],
     seen: tuple[PyTree, PyTree, PyTree],
     points: Points | None,
     emitted: Float[Array, "_ 3"] | None,
 ) -> Float[Array, "_ c"]:
-    """Radiance of a group's vertices, or of points on it.
-
-    Args:
-        surface: The group.
-        arriving: Direct light, reflected light, and radiance of each lamp.
-        seen: The result of `view_of`.
-        points: The points; None for the vertices.
-        emitted: Radiance that they emit; None without.
-    """
+    """Radiance of the light that arrives at a group and of emission."""
     system = surface.system if points is None else surface.system.at(points)
     if isinstance(seen[0], widened.WidenedView):
         assert widened.can_widen(system)

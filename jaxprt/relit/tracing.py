@@ -25,11 +25,11 @@ from jaxprt import require
 from jaxprt.compile import jit, known, put
 from jaxprt.relit import canvas
 from jaxprt.relit.casting import Caster, caster
-from jaxprt.relit.groups import Arriving, Stage, Surface, look_at
-from jaxprt.relit.surface import Viewed, lit, view
+from jaxprt.relit.groups import Arriving, Stage, look_at
+from jaxprt.relit.surface import Viewed, radiance, view
 from jaxprt.scene import Mesh
 from jaxprt.scene.points import Points
-from jaxprt.systems.bounces.traced import SharpPart
+from jaxprt.systems.bounces import ReflectingPart
 from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.lamps.relight import beside
 from jaxprt.systems.protocol import Blend
@@ -37,30 +37,35 @@ from jaxprt.systems.protocol import Blend
 _MOST_RAYS = 1 << 12  # of each vertex or point
 
 
-class Asked(eqx.Module):
-    """Vertices or points of a group from which rays start.
+class RayOrigins(eqx.Module):
+    """Vertices or points of a group from which reflection rays start.
 
     Attributes:
         number: Index of the group.
         points: The points in the scene.
-        own: The points on the group; None for all its vertices.
+        on_group: The points on the group; None for all its vertices.
         blend: Material weights of the vertices or points.
-        seen: 1 where narrow lobes are traced, 0 elsewhere; None for 1 everywhere.
+        share: 1 where narrow lobes are traced, 0 elsewhere; None for 1 everywhere.
         lamps: The transport of the lamps to the points; None to interpolate it between vertices.
         at_vertices: Whether the points are vertices, from which rays start elsewhere than from points of triangles.
     """
 
     number: int = eqx.field(static=True)
     points: Points
-    own: Points | None
+    on_group: Points | None
     blend: Blend | None
-    seen: Float[Array, " v"] | None
+    share: Float[Array, " v"] | None
     lamps: LampTransport | None = None
     at_vertices: bool = eqx.field(static=True, default=False)
 
+    @property
+    def parameter(self) -> tuple[Float[Array, " v"], ...]:
+        """Parameters of the BRDF at the vertices or points."""
+        return () if self.blend is None else self.blend.parameter
 
-class Carried(eqx.Module):
-    """The rays of one `Asked`.
+
+class PathWeights(eqx.Module):
+    """What the rays of some origins bring to the eye.
 
     Attributes:
         slot: Index of each ray's hit among all hits; the number of hits if there is none.
@@ -79,109 +84,105 @@ class HitRow(eqx.Module):
     Attributes:
         number: Index of the group.
         points: The hits as points of the scene.
-        own: The hits as points on the group.
+        on_group: The hits as points on the group.
         eye: Origin of the ray of each hit.
         variance: Variance of the directions into which a cone around each ray is reflected, in squared radians.
-        kept: What does not depend on the light; None if it is computed anew for each light.
+        viewed: What does not depend on the light; None if it is computed anew for each light.
     """
 
     number: int = eqx.field(static=True)
     points: Points
-    own: Points
+    on_group: Points
     eye: Float[Array, "h 3"]
     variance: Float[Array, " h"]
-    kept: Viewed | None
+    viewed: Viewed | None
 
 
 class Reflections(eqx.Module):
     """The traced reflections of a view.
 
     Attributes:
-        own: The rays of each `Asked`, in the given order.
-        hit: The surfaces that they hit.
+        paths: The rays of each `RayOrigins`, in the given order.
+        hits: The surfaces that they hit.
     """
 
-    own: tuple[Carried, ...]
-    hit: tuple[HitRow, ...]
+    paths: tuple[PathWeights, ...]
+    hits: tuple[HitRow, ...]
 
     def radiance(self, stage: Stage, arriving: Arriving) -> list[Float[Array, "_ c"]]:
-        """The reflected radiance that rays add at each vertex or point, one array for each `Asked`.
+        """The reflected radiance that rays add at each vertex or point, one array for each `RayOrigins`.
 
         Args:
             stage: The scene and its materials.
             arriving: The light that arrives at it.
         """
-        rows = []
-        for row in self.hit:
-            seen = _viewed(stage, row) if row.kept is None else row.kept
-            rows.append(lit(plain(stage.surfaces[row.number]), arriving.at(row.number), seen))
-        return _read(self.own, rows, arriving.lamp)
-
-
-def plain(surface: Surface) -> Surface:
-    """The surface as rays see it: it reflects by harmonics alone."""
-    part = surface.reflecting
-    return dataclasses.replace(surface, reflecting=part.plain) if isinstance(part, SharpPart) else surface
+        colors = []
+        for row in self.hits:
+            viewed = _viewed(stage, row) if row.viewed is None else row.viewed
+            colors.append(radiance(stage.surfaces[row.number].without_rays, arriving.at(row.number), viewed))
+        return _read(self.paths, colors, arriving.lamp)
 
 
 def _viewed(stage: Stage, row: HitRow) -> Viewed:
     """What does not depend on the light, at the hits of a row."""
     look, given = look_at(stage.table, stage.rough, row.points), stage.given[row.number]
     options = {"given": given, "variance": row.variance, "glows": False}
-    return view(plain(stage.surfaces[row.number]), row.own, look, row.eye, **options)
+    return view(stage.surfaces[row.number].without_rays, row.on_group, look, row.eye, **options)
 
 
-def trace(stage: Stage, asked: Sequence[Asked], eye: Float[Array, "3"], *, keep: bool) -> Reflections:
+def trace(stage: Stage, origins: Sequence[RayOrigins], eye: Float[Array, "3"], *, keep: bool) -> Reflections:
     """Casts the reflection rays of some vertices or points.
 
     Args:
         stage: The scene and its materials.
-        asked: Vertices or points from which rays start, of groups with a `SharpPart`.
+        origins: Vertices or points from which rays start, of groups with rays.
         eye: Position of the viewer.
         keep: Whether to store what depends on the view of the hits, for many lights.
 
     Raises:
         ValueError: The eye, the roughness, the points or the scene is traced by JAX.
     """
-    _check(stage.whole, asked[0], stage.surfaces[asked[0].number].reflecting, eye)
-    cast = caster(stage.whole)
-    found, rays = [], []
-    for each in asked:
-        sharp = stage.surfaces[each.number].reflecting
-        assert isinstance(sharp, SharpPart)
-        parameter = () if each.blend is None else each.blend.parameter
-        _check(stage.whole, each, sharp, eye)
+    for origin in origins:
+        _check(stage.whole, origin, stage.surfaces[origin.number].reflecting, eye)
+    cast, hits, rays = caster(stage.whole), [], []
+    for origin in origins:
         with jax.ensure_compile_time_eval():
-            rays.append(sharp.rays(eye, parameter, each.own, each.seen))
-            met = cast.cast(rays[-1], each.points, at_vertices=each.at_vertices)
-            found.append((*met, cast.spread(rays[-1], *met)))
-    slots, hit = _rows(stage, cast, found, keep=keep)
-    own = []
-    for each, ray, slot, (triangle, *_) in zip(asked, rays, slots, found, strict=True):
-        sharp = stage.surfaces[each.number].reflecting
-        assert isinstance(sharp, SharpPart)
-        weight = sharp.weights(ray, eye, each.blend, each.own, each.seen)
+            bundle = _reflecting(stage, origin).rays(eye, origin.parameter, origin.on_group, origin.share)
+            hit = cast.cast(bundle, origin.points, at_vertices=origin.at_vertices)
+            hits.append((*hit, cast.spread(bundle, *hit)))
+            rays.append(bundle)
+    slots, rows = _rows(stage, cast, hits, keep=keep)
+    paths = []
+    for origin, bundle, slot, (triangle, *_) in zip(origins, rays, slots, hits, strict=True):
+        weight = _reflecting(stage, origin).weights(bundle, eye, origin.blend, origin.on_group, origin.share)
         part = np.where(triangle >= 0, stage.part[cast.face[triangle, 0]], -1)
-        own.append(Carried(slot, weight, _lamps(stage, each, part, weight, ray.concentration)))
-    return Reflections(tuple(own), hit)
+        paths.append(PathWeights(slot, weight, _lamps(stage, origin, part, weight, bundle.concentration)))
+    return Reflections(tuple(paths), rows)
+
+
+def _reflecting(stage: Stage, origin: RayOrigins) -> ReflectingPart:
+    """How the group of some origins reflects."""
+    reflecting = stage.surfaces[origin.number].reflecting
+    assert reflecting is not None
+    return reflecting
 
 
 def _lamps(
-    stage: Stage, asked: Asked, part: Int[np.ndarray, "j v"], weight: Array, concentration: Array
+    stage: Stage, origin: RayOrigins, part: Int[np.ndarray, "j v"], weight: Array, concentration: Array
 ) -> Float[Array, "n v c"] | None:
     """Factor of the radiance of each lamp at each vertex or point, given the part that each ray hits (-1 for none)."""
-    lit = stage.surfaces[asked.number].lit
+    lit = stage.surfaces[origin.number].lit
     if lit is None:
         return None
     lamp = np.where(part >= 0, np.asarray(stage.lamp)[part], -1)
-    met = lamp == np.arange(lit.transport.lamps)[:, None, None]
-    chord = lit.chord(asked.own) if asked.lamps is None else lit.at(asked.lamps).chord()
-    return _seen_lamps(chord, put(met), weight, concentration)
+    hits_lamp = lamp == np.arange(lit.transport.lamps)[:, None, None]
+    chord = lit.chord(origin.on_group) if origin.lamps is None else lit.at(origin.lamps).chord()
+    return _seen_lamps(chord, put(hits_lamp), weight, concentration)
 
 
 @jit
-def _seen_lamps(chord: Array, met: Array, weight: Array, concentration: Array) -> Float[Array, "n v c"]:
-    share = beside(concentration, chord[:, None]) * met
+def _seen_lamps(chord: Array, hits_lamp: Array, weight: Array, concentration: Array) -> Float[Array, "n v c"]:
+    share = beside(concentration, chord[:, None]) * hits_lamp
     return jnp.einsum("njv,jvc->nvc", share, weight, precision="highest")
 
 
@@ -199,9 +200,8 @@ def _facing(mesh: Mesh, eye: Float[Array, "3"]) -> Float[Array, " v"]:
     return jnp.zeros_like(mesh.position[:, 0]).at[mesh.face].max(seen[:, None])
 
 
-def _check(mesh: Mesh, asked: Asked, part: Any, eye: Any) -> None:
-    parameter = () if asked.blend is None else asked.blend.parameter
-    names = {"the eye": eye, "the roughness": parameter, "the scene": (mesh, part), "the points": asked.points}
+def _check(mesh: Mesh, origin: RayOrigins, part: Any, eye: Any) -> None:
+    names = {"the eye": eye, "the roughness": origin.parameter, "the scene": (mesh, part), "the points": origin.points}
     wrong = [name for name, value in names.items() if not known(value)]
     if wrong:
         raise ValueError(
@@ -211,13 +211,12 @@ def _check(mesh: Mesh, asked: Asked, part: Any, eye: Any) -> None:
         )
 
 
-def _rows(stage: Stage, cast: Caster, found: Sequence[tuple], *, keep: bool) -> tuple[list[Any], tuple[HitRow, ...]]:
+def _rows(stage: Stage, cast: Caster, hits: Sequence[tuple], *, keep: bool) -> tuple[list[Any], tuple[HitRow, ...]]:
     """Slots of all rays, and the hits of each group in rows of one length."""
-    shape = [each[0].shape for each in found]
-    triangle = np.concatenate([np.zeros(0, int), *(each[0].ravel() for each in found)])
-    weight = np.concatenate([np.zeros((0, 3), np.float32), *(each[1].reshape(-1, 3) for each in found)])
-    start = np.concatenate([np.zeros((0, 3), np.float32), *(np.tile(each[2], (len(each[0]), 1)) for each in found)])
-    variance = np.concatenate([np.zeros(0, np.float32), *(each[3].ravel() for each in found)])
+    triangle = np.concatenate([np.zeros(0, int), *(hit[0].ravel() for hit in hits)])
+    weight = np.concatenate([np.zeros((0, 3), np.float32), *(hit[1].reshape(-1, 3) for hit in hits)])
+    start = np.concatenate([np.zeros((0, 3), np.float32), *(np.tile(hit[2], (len(hit[0]), 1)) for hit in hits)])
+    variance = np.concatenate([np.zeros(0, np.float32), *(hit[3].ravel() for hit in hits)])
     part = np.where(triangle >= 0, stage.part[cast.face[triangle, 0]], -1)
     group = np.where(part >= 0, stage.place.group[part], -1)
     slot, rows, total = np.full(len(triangle), -1, np.int32), [], 0
@@ -230,33 +229,33 @@ def _rows(stage: Stage, cast: Caster, found: Sequence[tuple], *, keep: bool) -> 
         total += count * canvas.ROW
         # Padding repeats the last hit.
         index = np.pad(index, (0, count * canvas.ROW - len(index)), mode="edge").reshape(count, canvas.ROW)
-        for each in index:
-            corner = cast.face[triangle[each]].T.astype(np.int32)
+        for hit in index:
+            corner = cast.face[triangle[hit]].T.astype(np.int32)
             places = corner, corner - stage.shift[corner[0]]
             still = np.zeros((2, 3, canvas.ROW), weight.dtype)
-            points, own = (put(Points(place, weight[each].T.copy(), still)) for place in places)
-            eye, wide = put((start[each], variance[each]))
-            row = HitRow(number, points, own, eye, wide, None)
-            rows.append(dataclasses.replace(row, kept=_viewed(stage, row)) if keep else row)
+            points, on_group = (put(Points(place, weight[hit].T.copy(), still)) for place in places)
+            eye, spread = put((start[hit], variance[hit]))
+            row = HitRow(number, points, on_group, eye, spread, None)
+            rows.append(dataclasses.replace(row, viewed=_viewed(stage, row)) if keep else row)
     slot = np.where(slot < 0, total, slot)
-    ends = np.cumsum([np.prod(each) for each in shape])[:-1] if shape else []
-    return [each.reshape(size) for each, size in zip(np.split(slot, ends), shape, strict=True)], tuple(rows)
+    shape = [hit[0].shape for hit in hits]
+    ends = np.cumsum([np.prod(size) for size in shape])[:-1] if shape else []
+    return [of_origin.reshape(size) for of_origin, size in zip(np.split(slot, ends), shape, strict=True)], tuple(rows)
 
 
-def _read(own: Sequence[Carried], rows: Sequence[Array], lamp: Array | None) -> list[Array]:
+def _read(paths: Sequence[PathWeights], rows: Sequence[Array], lamp: Array | None) -> list[Array]:
     """The weighted sum over rays of the radiance that they read."""
-    colors = max([1, *(each.shape[1] for each in rows)])
-    host = known(rows, own)
-    xp = np if host else jnp  # The number of hits depends on the view.
+    colors = max([1, *(row.shape[1] for row in rows)])
+    xp = np if known(rows, paths) else jnp  # The number of hits depends on the view.
     dtype = jnp.result_type(float) if not rows else rows[0].dtype
-    flat = [xp.broadcast_to(xp.asarray(each), (len(each), colors)) for each in rows]
+    flat = [xp.broadcast_to(xp.asarray(row), (len(row), colors)) for row in rows]
     color = xp.concatenate([*flat, xp.zeros((1, colors), dtype)])
-    return [_weighed(color[xp.asarray(each.slot)], each.weight, lamp, each.lamp) for each in own]
+    return [_weighed(color[xp.asarray(path.slot)], path.weight, lamp, path.lamp) for path in paths]
 
 
 @jit
 def _weighed(read: Array, weight: Array, lamp: Array | None, share: Array | None) -> Float[Array, "v c"]:
-    result = reduce(jnp.add, (color * each for color, each in zip(read, weight, strict=True)))
+    result = reduce(jnp.add, (color * factor for color, factor in zip(read, weight, strict=True)))
     if lamp is None or share is None:
         return result
     return result + jnp.einsum("nc,nvc->vc", lamp, share, precision="highest")

@@ -80,10 +80,12 @@ def test_a_ball_spreads_the_cone_of_a_ray_as_its_curvature_says():
     middle = np.asarray(ball.position)[cast.face[face]].mean(0)
     start = np.stack([middle * (1 + distance / radius), middle])
     ones = jnp.ones((1, 2))
-    rays = traced.Rays(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2), jnp.int32), ones, 50 * ones)
+    rays = traced.ReflectionRays(jnp.zeros((1, 2, 3)), jnp.zeros((1, 2), jnp.int32), ones, 50 * ones)
     spread = cast.spread(rays, *hit, start)
     np.testing.assert_allclose(spread[0, 0], (1 + 2 * distance / radius) ** 2 / 50, rtol=0.05)
-    few = traced.Rays(jnp.zeros((4, 2, 3)), jnp.zeros((4, 2), jnp.int32), jnp.full((4, 2), 0.5), jnp.full((4, 2), 50.0))
+    few = traced.ReflectionRays(
+        jnp.zeros((4, 2, 3)), jnp.zeros((4, 2), jnp.int32), jnp.full((4, 2), 0.5), jnp.full((4, 2), 50.0)
+    )
     four = cast.spread(few, *(np.repeat(each, 4, 0) for each in hit), start)
     np.testing.assert_allclose(four[:, 0], spread[0, 0] / 2, rtol=1e-5)
     assert np.all(spread <= 1)
@@ -99,7 +101,7 @@ def mirrored(place: np.ndarray) -> np.ndarray:
 
 def test_a_mirror_shows_a_wall_that_glows_where_the_closed_form_has_it():
     ready = relit()
-    assert [each is not None for each in ready.lobes] == [True, False]
+    assert [surface.has_rays for surface in ready.surfaces] == [True, False]
     color = np.asarray(ready.radiance(DARK, eye=EYE))[:49]
     inside = mirrored(np.array(mesh("floor").position))
     shown, bare = inside > 0.1, inside < -0.1
@@ -187,7 +189,7 @@ def test_what_reflects_nothing_but_the_sky_shows_no_rays(close):
     ready = prt.precompute(alone, refine=False, system=Lobes(4, 0), size=SIZE, bounces=1, progress=False)
     view = ready.view(EYE)
     assert view.reflected is not None
-    assert view.reflected.hit == ()
+    assert view.reflected.hits == ()
     direct = ready.without_bounces().radiance(light(), eye=EYE)
     seen = np.asarray(facing(ready.mesh, EYE)) > 0
     assert 0.3 < seen.mean() < 0.8

@@ -5,6 +5,7 @@ transfer tensor: a part, or several parts of similar materials. All regions of a
 functions, weighted by the mean material of each region.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -18,16 +19,23 @@ from jaxprt.compile import jit, promoted
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
 from jaxprt.systems import harmonic
+from jaxprt.systems.bounces import traced
 from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.bounces.relight import LitTransfer, collect, light_side
 from jaxprt.systems.bounces.tensor import TransferTensor
-from jaxprt.systems.bounces.varying import Sent
+from jaxprt.systems.bounces.traced import ReflectionRays
+from jaxprt.systems.bounces.varying import FunctionWeights
 from jaxprt.systems.harmonic import HarmonicBrdf
+from jaxprt.systems.lobe import LobeBrdf
+from jaxprt.systems.lobe.table import Lobes
 from jaxprt.systems.protocol import Blend
 
 
 class ReflectingPart(eqx.Module):
-    """Vertices with one BRDF, with which they reflect arriving light that is given in harmonics.
+    """Vertices with one BRDF, with which they reflect arriving light.
+
+    Light arrives in harmonics. With `lobe`, rays stand for what is too sharp for them: `view` omits it, and `rays` and
+    `weights` give the rays.
 
     Attributes:
         position: Positions of the vertices.
@@ -35,30 +43,103 @@ class ReflectingPart(eqx.Module):
         brdf: Table of degree 3, from `jaxprt.harmonic.tabulate`.
         sent: Weights of the tensor's functions for each channel of `brdf` and each roughness. None if the channels of
             both are the same, and light that is sent to other surfaces has one roughness.
+        lobe: The BRDF as lobes, from `jaxprt.lobe.tabulate`, with the channels and parameters of `brdf`, whose narrow
+            lobes rays represent; None to reflect by harmonics alone.
+        count: Number of rays of each vertex or point.
     """
 
     position: Float[Array, "v 3"]
     frame: Float[Array, "v 3 3"]
     brdf: HarmonicBrdf
-    sent: Sent | None = eqx.field(default=None, kw_only=True)
+    sent: FunctionWeights | None = eqx.field(default=None, kw_only=True)
+    lobe: LobeBrdf | None = eqx.field(default=None, kw_only=True)
+    count: int = eqx.field(static=True, default=8, kw_only=True)
 
     def __check_init__(self):
-        """Refuses tables of another degree than that of the arriving light."""
+        """Refuses tables of other kinds or of another degree than the arriving light, and numbers of rays below 1."""
         require.kind("the BRDF", self.brdf, HarmonicBrdf, source="jaxprt.harmonic.tabulate")
         if self.brdf.degree != DEGREE:
             raise ValueError(f"the BRDF must have degree {DEGREE}, that of reflected light, got {self.brdf.degree}")
+        if self.lobe is not None:
+            require.kind("the lobes", self.lobe, LobeBrdf, source="jaxprt.lobe.tabulate")
+            require.at_least("the number of rays", np.asarray(self.count), 1.0)
+
+    @property
+    def harmonics_alone(self) -> "ReflectingPart":
+        """The same part without rays."""
+        return self if self.lobe is None else dataclasses.replace(self, lobe=None)
 
     def view(
-        self, eye: Float[Array, "*p 3"], blend: Blend | None, points: Points | None = None
+        self,
+        eye: Float[Array, "*p 3"],
+        blend: Blend | None,
+        points: Points | None = None,
+        seen: Float[Array, " _"] | None = None,
     ) -> Float[Array, "lm _ _"]:
-        """Harmonics of the BRDF at each vertex or point for its view direction. `blend` holds the weights there."""
-        return harmonic.system.blended_view(self.brdf, *placed(self.position, self.frame, points), blend, eye=eye)
+        """Harmonics of the BRDF at each vertex or point for its view direction, without what rays represent.
+
+        Args:
+            eye: Position of the viewer.
+            blend: Weights and parameters of the channels at the vertices or points.
+            points: The points; None for the vertices.
+            seen: Factor of what rays represent, at each vertex or point; None for 1.
+        """
+        whole = harmonic.system.blended_view(self.brdf, *placed(self.position, self.frame, points), blend, eye=eye)
+        return whole if self.lobe is None else whole - self.carried(eye, blend, points, seen)
+
+    def carried(
+        self,
+        eye: Float[Array, "*p 3"],
+        blend: Blend | None,
+        points: Points | None = None,
+        seen: Float[Array, " _"] | None = None,
+    ) -> Float[Array, "lm _ _"]:
+        """Harmonics of what rays represent. The arguments are those of `view`."""
+        return traced.harmonics_of(self._lobes(eye, _parameter(blend), points), blend, seen)
 
     def combine(
         self, light: Float[Array, "lm _ _"], view: Float[Array, "lm _ _"], points: Points | None = None
     ) -> Float[Array, "_ e"]:
-        """Radiance of reflected light. `light` is what arrives at the vertices."""
+        """Radiance of reflected light, without what rays represent. `light` is what arrives at the vertices."""
         return harmonic.system.combine(light if points is None else points.carry(light, axis=2), view)
+
+    def rays(
+        self,
+        eye: Float[Array, "3"],
+        parameter: tuple[Float[Array, " _"], ...],
+        points: Points | None = None,
+        seen: Float[Array, " _"] | None = None,
+    ) -> ReflectionRays:
+        """The rays of each vertex or point. Colors do not change them.
+
+        Args:
+            eye: Position of the viewer.
+            parameter: Parameters of the table at the vertices or points, as in `Blend`.
+            points: The points; None for the vertices.
+            seen: Factor of what rays represent, at each vertex or point; None for 1.
+        """
+        position, frame = placed(self.position, self.frame, points)
+        return traced.quantiles(self._lobes(eye, parameter, points), seen, position, frame, count=self.count)
+
+    def weights(
+        self,
+        rays: ReflectionRays,
+        eye: Float[Array, "3"],
+        blend: Blend | None,
+        points: Points | None = None,
+        seen: Float[Array, " _"] | None = None,
+    ) -> Float[Array, "j _ c"]:
+        """Factor of the radiance along each ray. The sum over the rays of a point is the albedo of its traced lobes."""
+        return traced.weights(self._lobes(eye, _parameter(blend), points), rays, blend, seen)
+
+    def _lobes(self, eye: Array, parameter: tuple[Array, ...], points: Points | None) -> Lobes:
+        if self.lobe is None:
+            raise ValueError("rays need a part with lobes, got one that reflects by harmonics alone")
+        return traced.lookup(self.lobe, *placed(self.position, self.frame, points), eye, parameter)
+
+
+def _parameter(blend: Blend | None) -> tuple[Array, ...]:
+    return () if blend is None else blend.parameter
 
 
 class Members(eqx.Module):

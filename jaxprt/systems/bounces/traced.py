@@ -18,13 +18,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxprt import require
 from jaxprt.compile import jit
 from jaxprt.decompose import mixture
-from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import directions, harmonics
 from jaxprt.systems.bounces.jobs import DEGREE
-from jaxprt.systems.bounces.parts import ReflectingPart
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.lobe.table import Lobes, traced_share
 from jaxprt.systems.protocol import Blend
@@ -35,7 +32,7 @@ _GOLDEN = (5**0.5 - 1) / 2  # fraction of a turn from one ray to the next
 _TINY = 1e-12
 
 
-class Rays(eqx.Module):
+class ReflectionRays(eqx.Module):
     """The rays of some vertices or points.
 
     Attributes:
@@ -49,89 +46,6 @@ class Rays(eqx.Module):
     lobe: Int[Array, "j v"]
     chance: Float[Array, "j v"]
     concentration: Float[Array, "j v"]
-
-
-class SharpPart(ReflectingPart):
-    """A part some of whose lobes are traced. `view` omits these lobes; `rays` gives the rays that represent them.
-
-    Attributes:
-        lobe: The BRDF as lobes, from `jaxprt.lobe.tabulate`, with the channels and parameters of `brdf`.
-        count: Number of rays of each vertex or point.
-    """
-
-    lobe: LobeBrdf
-    count: int = eqx.field(static=True, default=8)
-
-    def __check_init__(self):
-        """Refuses tables of other kinds, and numbers of rays below 1."""
-        require.kind("the lobes", self.lobe, LobeBrdf, source="jaxprt.lobe.tabulate")
-        require.at_least("the number of rays", np.asarray(self.count), 1.0)
-
-    def view(
-        self,
-        eye: Float[Array, "*p 3"],
-        blend: Blend | None,
-        points: Points | None = None,
-        seen: Float[Array, " _"] | None = None,
-    ) -> Float[Array, "lm _ _"]:
-        """Harmonics of the BRDF at each vertex or point for its view direction, without what rays represent.
-
-        Args:
-            eye: Position of the viewer.
-            blend: Weights and parameters of the channels at the vertices or points.
-            points: The points; None for the vertices.
-            seen: Factor of what rays represent, at each vertex or point; None for 1.
-        """
-        return self.plain.view(eye, blend, points) - self.carried(eye, blend, points, seen)
-
-    def carried(
-        self,
-        eye: Float[Array, "*p 3"],
-        blend: Blend | None,
-        points: Points | None = None,
-        seen: Float[Array, " _"] | None = None,
-    ) -> Float[Array, "lm _ _"]:
-        """Harmonics of what rays represent. The arguments are those of `view`."""
-        return _carried(self._lobes(eye, blend, points), blend, seen)
-
-    @property
-    def plain(self) -> ReflectingPart:
-        """The same part without tracing."""
-        return ReflectingPart(self.position, self.frame, self.brdf, sent=self.sent)
-
-    def rays(
-        self,
-        eye: Float[Array, "3"],
-        parameter: tuple[Float[Array, " _"], ...],
-        points: Points | None = None,
-        seen: Float[Array, " _"] | None = None,
-    ) -> Rays:
-        """The rays of each vertex or point. Colors do not change them.
-
-        Args:
-            eye: Position of the viewer.
-            parameter: Parameters of the table at the vertices or points, as in `Blend`.
-            points: The points; None for the vertices.
-            seen: Factor of what rays represent, at each vertex or point; None for 1.
-        """
-        position, frame = placed(self.position, self.frame, points)
-        lobes = _looked_up(self.lobe, position, frame, eye, parameter)
-        return _chosen(lobes, seen, position, frame, count=self.count)
-
-    def weights(
-        self,
-        rays: Rays,
-        eye: Float[Array, "3"],
-        blend: Blend | None,
-        points: Points | None = None,
-        seen: Float[Array, " _"] | None = None,
-    ) -> Float[Array, "j _ c"]:
-        """Factor of the radiance along each ray. The sum over the rays of a point is the albedo of its traced lobes."""
-        return _weighed(self._lobes(eye, blend, points), rays, blend, seen)
-
-    def _lobes(self, eye: Array, blend: Blend | None, points: Points | None) -> Lobes:
-        position, frame = placed(self.position, self.frame, points)
-        return _looked_up(self.lobe, position, frame, eye, () if blend is None else blend.parameter)
 
 
 @jit
@@ -178,36 +92,49 @@ def is_sharp(table: LobeBrdf) -> bool:
 
 
 @jit
-def _carried(lobes: Lobes, blend: Blend | None, seen: Float[Array, " v"] | None) -> Float[Array, "lm c v"]:
-    """Harmonics, in local frames, of what rays represent."""
-    strong = _strength(lobes, blend, seen)
+def lookup(
+    table: LobeBrdf,
+    position: Float[Array, "v 3"],
+    frame: Float[Array, "v 3 3"],
+    eye: Float[Array, "*p 3"],
+    parameter: tuple[Float[Array, " v"], ...],
+) -> Lobes:
+    """The lobes of points towards the eye."""
+    return table.lookup(directions.view(frame, position, eye), *parameter)
+
+
+@jit
+def harmonics_of(lobes: Lobes, blend: Blend | None, seen: Float[Array, " v"] | None) -> Float[Array, "lm c v"]:
+    """Harmonics, in local frames, of what rays represent.
+
+    Args:
+        lobes: The lobes of each point.
+        blend: Weights of the channels of each point; None for channels as colors.
+        seen: Factor of what rays represent, at each point; None for 1.
+    """
+    weight = _traced_weight(lobes, blend, seen)
     band = mixture.bands(lobes.concentration, degree=DEGREE)
     basis = jnp.moveaxis(harmonics.evaluate(jnp.moveaxis(lobes.mean, 0, -1), degree=DEGREE), -1, 0)
-    each = range(lobes.mean.shape[1])
     rows = [
-        reduce(jnp.add, (strong[:, i] * (band[math.isqrt(s), i] * basis[s, i]) for i in each))
+        reduce(jnp.add, (weight[:, i] * (band[math.isqrt(s), i] * basis[s, i]) for i in range(lobes.mean.shape[1])))
         for s in range(len(basis))
     ]
     return jnp.stack(rows)
 
 
-@jit
-def _looked_up(table: LobeBrdf, position: Array, frame: Array, eye: Array, parameter: tuple[Array, ...]) -> Lobes:
-    return table.lookup(directions.view(frame, position, eye), *parameter)
-
-
-def _strength(lobes: Lobes, blend: Blend | None, seen: Array | None) -> Float[Array, "c l v"]:
-    """Weight of the traced fraction of each lobe in each color."""
-    traced = traced_share(lobes.concentration)
-    weight = lobes.weight * (traced if seen is None else traced * seen)
-    if blend is None:
-        return weight
-    return jnp.einsum("klv,vkc->clv", weight, blend.weight, precision="highest")
-
-
 @partial(jit, static_argnames="count")
-def _chosen(lobes: Lobes, seen: Array | None, position: Array, frame: Array, *, count: int) -> Rays:
-    """Quantiles of the mixture of the narrow lobes, rotated by a random angle at each point."""
+def quantiles(
+    lobes: Lobes, seen: Float[Array, " v"] | None, position: Array, frame: Float[Array, "v 3 3"], *, count: int
+) -> ReflectionRays:
+    """The rays of each point: quantiles of the mixture of its narrow lobes, rotated by a random angle.
+
+    Args:
+        lobes: The lobes of each point. Their colors do not change the rays.
+        seen: Factor of what rays represent, at each point; None for 1.
+        position: Positions of the points, which choose the angle.
+        frame: Frames of the points.
+        count: Number of rays of each point.
+    """
     mass = jnp.maximum(jnp.sum(lobes.weight, 0), 0) * traced_share(lobes.concentration)
     total = jnp.sum(mass if seen is None else mass * seen, 0)
     chance = jnp.where(total > 0, mass / jnp.where(total > 0, total, 1), 0)
@@ -216,26 +143,38 @@ def _chosen(lobes: Lobes, seen: Array | None, position: Array, frame: Array, *, 
     place = (jnp.arange(count, dtype=shift.dtype)[:, None] + shift) / count
     number = jnp.minimum(jnp.sum(above[:, None] <= place, 0), len(above) - 1)
 
-    def each(value: Float[Array, "l v"]) -> Float[Array, "j v"]:
+    def of_lobe(value: Float[Array, "l v"]) -> Float[Array, "j v"]:
         return jnp.take_along_axis(value, number, 0)
 
-    own, concentration = each(chance), each(lobes.concentration)
-    within = jnp.clip((place - each(above) + own) / jnp.where(own > 0, own, 1), 0, 1 - 1e-6)
+    share, concentration = of_lobe(chance), of_lobe(lobes.concentration)
+    within = jnp.clip((place - of_lobe(above) + share) / jnp.where(share > 0, share, 1), 0, 1 - 1e-6)
     drop = -jnp.log1p(within * jnp.expm1(-2 * concentration)) / concentration
     angle = 2 * np.pi * (turn + _GOLDEN * jnp.arange(count, dtype=turn.dtype)[:, None])
-    local = _around([each(axis) for axis in lobes.mean], drop, angle)
+    local = _around([of_lobe(axis) for axis in lobes.mean], drop, angle)
     world = [reduce(jnp.add, (local[i] * frame[:, i, j] for i in range(3))) for j in range(3)]
-    return Rays(jnp.stack(world, -1), number.astype(jnp.int32), own, concentration)
+    return ReflectionRays(jnp.stack(world, -1), number.astype(jnp.int32), share, concentration)
 
 
 @jit
-def _weighed(lobes: Lobes, rays: Rays, blend: Blend | None, seen: Array | None) -> Float[Array, "j v c"]:
-    strong = _strength(lobes, blend, seen)
-    taken = jnp.stack([jnp.take_along_axis(each, rays.lobe, 0) for each in strong], -1)
+def weights(
+    lobes: Lobes, rays: ReflectionRays, blend: Blend | None, seen: Float[Array, " v"] | None
+) -> Float[Array, "j v c"]:
+    """Factor of the radiance along each ray. The sum over the rays of a point is the albedo of its traced lobes."""
+    lobe_weight = _traced_weight(lobes, blend, seen)
+    taken = jnp.stack([jnp.take_along_axis(color, rays.lobe, 0) for color in lobe_weight], -1)
     weight = jnp.where(rays.chance > 0, 1 / jnp.where(rays.chance > 0, rays.chance, 1), 0)[..., None] * taken
     # Normalize, so that the rays have exactly the energy of the lobes in every color.
-    whole, found = jnp.sum(strong, 1).T, jnp.sum(weight, 0)
-    return weight * (whole / jnp.where(found > _TINY, found, 1))
+    albedo, total = jnp.sum(lobe_weight, 1).T, jnp.sum(weight, 0)
+    return weight * (albedo / jnp.where(total > _TINY, total, 1))
+
+
+def _traced_weight(lobes: Lobes, blend: Blend | None, seen: Array | None) -> Float[Array, "c l v"]:
+    """Weight of the traced fraction of each lobe in each color."""
+    traced = traced_share(lobes.concentration)
+    weight = lobes.weight * (traced if seen is None else traced * seen)
+    if blend is None:
+        return weight
+    return jnp.einsum("klv,vkc->clv", weight, blend.weight, precision="highest")
 
 
 def _around(mean: list[Array], drop: Array, angle: Array) -> list[Array]:

@@ -18,7 +18,7 @@ from jaxprt.compile import jit
 from jaxprt.systems.protocol import Blend
 
 
-class Sent(eqx.Module):
+class FunctionWeights(eqx.Module):
     """Weights of path functions for the channels of a BRDF.
 
     Attributes:
@@ -44,7 +44,7 @@ class Sent(eqx.Module):
 
 
 @jit
-def _weights(sent: Sent, blend: Blend) -> Array:
+def _weights(sent: FunctionWeights, blend: Blend) -> Array:
     if not sent.knot:
         return jnp.einsum("kp,vkc->vpc", sent.factor[0], blend.weight, precision="highest")
     pairs = zip(sent.knot, blend.parameter, strict=True)

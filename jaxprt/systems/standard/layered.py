@@ -19,7 +19,7 @@ from jaxprt import require
 from jaxprt.brdf import GGX, Charlie, CoatedModel, MetallicRoughness, UnderSheen, coat_reflectance, sheen_albedo
 from jaxprt.brdf.varying import Channels
 from jaxprt.systems.bounces import traced
-from jaxprt.systems.bounces.varying import Sent
+from jaxprt.systems.bounces.varying import FunctionWeights
 from jaxprt.systems.dynamic import DynamicBrdf
 from jaxprt.systems.harmonic import HarmonicBrdf
 from jaxprt.systems.lobe import LobeBrdf
@@ -154,7 +154,7 @@ class LayeredTable(StandardTable):
         """The BRDF in spherical harmonics up to a degree."""
         return _harmonics(self.over, degree, jnp.result_type(float))
 
-    def paths(self) -> tuple[SeparableBrdf, Sent]:
+    def paths(self) -> tuple[SeparableBrdf, FunctionWeights]:
         """The functions with which parts send light to others, and their weights over both roughnesses.
 
         Others receive the light of a sheen as that of a matte surface of the same albedo.
@@ -273,7 +273,7 @@ def _harmonics(over: str, degree: int, dtype: Any) -> HarmonicBrdf:
 
 
 @functools.cache
-def _paths(over: str, dtype: Any) -> tuple[SeparableBrdf, Sent]:
+def _paths(over: str, dtype: Any) -> tuple[SeparableBrdf, FunctionWeights]:
     layer = _LAYERS[over]
     brdf, sent = METALLIC_ROUGHNESS.paths()
     factor, knot = np.asarray(sent.factor), layer.table.knot
@@ -286,4 +286,6 @@ def _paths(over: str, dtype: Any) -> tuple[SeparableBrdf, Sent]:
     base = np.broadcast_to(factor[:, None], (*shape, *factor.shape[1:]))
     layers = np.broadcast_to(own[:, None], (*shape, 1, factor.shape[2]))
     whole = np.concatenate([base, base * (1 - taken[:, None, None]), layers], 2)
-    return brdf, Sent((sent.knot[0], tables.constant(knot, dtype=dtype)), tables.constant(whole, dtype=dtype))
+    return brdf, FunctionWeights(
+        (sent.knot[0], tables.constant(knot, dtype=dtype)), tables.constant(whole, dtype=dtype)
+    )

@@ -20,7 +20,7 @@ from jaxprt import require
 from jaxprt.sphere import harmonics, hemisphere
 from jaxprt.systems import dynamic, lobe
 from jaxprt.systems.bounces import traced
-from jaxprt.systems.bounces.varying import Sent
+from jaxprt.systems.bounces.varying import FunctionWeights
 from jaxprt.systems.dynamic import DynamicBrdf
 from jaxprt.systems.harmonic import HarmonicBrdf
 from jaxprt.systems.lobe import LobeBrdf
@@ -146,7 +146,7 @@ class StandardTable:
         """Whether the functions of light paths are shipped."""
         return "path.view" in self._stored
 
-    def paths(self) -> tuple[SeparableBrdf, Sent]:
+    def paths(self) -> tuple[SeparableBrdf, FunctionWeights]:
         """The functions with which parts send light to others, and their weights over roughness.
 
         Raises:
@@ -276,11 +276,11 @@ def _harmonics(table: StandardTable, degree: int, dtype: Any) -> HarmonicBrdf:
 
 
 @functools.cache
-def _paths(table: StandardTable, dtype: Any) -> tuple[SeparableBrdf, Sent]:
+def _paths(table: StandardTable, dtype: Any) -> tuple[SeparableBrdf, FunctionWeights]:
     names = "light", "view", "factor", "error"
     light, view, factor, error = (constant(table._stored[f"path.{name}"], dtype=dtype) for name in names)
     knot = (constant(table._stored["knot"], dtype=dtype),)
-    return SeparableBrdf(light, view, error, hemisphere.parabolic_coordinates), Sent(knot, factor)
+    return SeparableBrdf(light, view, error, hemisphere.parabolic_coordinates), FunctionWeights(knot, factor)
 
 
 def _dtype() -> Any:

@@ -11,8 +11,7 @@ from jaxprt import Blend, harmonic, lobe
 from jaxprt.brdf import BlinnPhong, Lambert
 from jaxprt.brdf.varying import Channels
 from jaxprt.sphere import directions, harmonics
-from jaxprt.systems.bounces import traced
-from jaxprt.systems.bounces.traced import SharpPart
+from jaxprt.systems.bounces import ReflectingPart, traced
 from jaxprt.systems.lobe import table
 
 pytestmark = pytest.mark.usefixtures("coarse")
@@ -27,7 +26,7 @@ def shiny(log_roughness):
 
 
 @functools.cache
-def part(count: int = 8) -> SharpPart:
+def part(count: int = 8) -> ReflectingPart:
     """Points of a ball, seen from above, of all roughness."""
     way = np.random.default_rng(0).normal(size=(POINTS, 3))
     way[:, 1] = np.abs(way[:, 1]) + 0.5
@@ -37,7 +36,7 @@ def part(count: int = 8) -> SharpPart:
         harmonic.tabulate(shiny, degree=3, knot=knot, error=0.5),
         lobe.tabulate(shiny, lobes=6, knot=knot, resolution=12),
     )
-    return SharpPart(way, directions.frame(way, jnp.zeros_like(way)), *tables, count)
+    return ReflectingPart(way, directions.frame(way, jnp.zeros_like(way)), tables[0], lobe=tables[1], count=count)
 
 
 def blend(roughness: float) -> Blend:
@@ -97,14 +96,17 @@ def test_what_the_eye_cannot_see_stays_with_the_harmonics(close):
     weight = own.weights(rays, EYE, blend(0.06), None, half)
     assert np.all(np.asarray(weight)[:, ::2] == 0)
     view = own.view(EYE, blend(0.06), None, half)
-    close(view[..., ::2], own.plain.view(EYE, blend(0.06))[..., ::2])
+    close(view[..., ::2], own.harmonics_alone.view(EYE, blend(0.06))[..., ::2])
     close(view[..., 1::2], own.view(EYE, blend(0.06))[..., 1::2])
 
 
 def test_an_eye_for_each_point_is_the_eye_of_all(close):
     own, each = part(), jnp.broadcast_to(EYE, (POINTS, 3))
     close(own.view(each, blend(0.2)), own.view(EYE, blend(0.2)))
-    close(own.plain.view(each.at[0].set(2 * EYE), blend(0.2))[..., 1:], own.plain.view(EYE, blend(0.2))[..., 1:])
+    close(
+        own.harmonics_alone.view(each.at[0].set(2 * EYE), blend(0.2))[..., 1:],
+        own.harmonics_alone.view(EYE, blend(0.2))[..., 1:],
+    )
 
 
 def test_points_scatter_evenly_and_places_alike(close):
