@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float, Float16
 
 from jaxprt import visibility
@@ -20,10 +21,12 @@ from jaxprt.systems.separable import SeparableBrdf, clustered
 from jaxprt.visibility import members
 
 # Versions of the algorithms that make the results. A release that changes results increments one.
-ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "transfer": 3}
+ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "transfer": 4}
 DEGREE = gather.DEGREE  # degree of the harmonics that arrive
 _GROUPS = 128  # groups of rays that are summed by one program
 _AGAIN = 2  # edge of the light's faces for two bounces
+_SAMPLE = 4096  # most vertices of a basis from whose responses the modes of the light are found
+_DIM = 0.03  # responses of vertices count relative to their size, unless they are this small beside the mean
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,7 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
         region: Index of each vertex's region.
         member: Vertices of each cluster.
         components: Number of principal components over the vertices of a cluster.
+        modes: Number of principal components over the light.
     """
 
     bases: tuple[SeparableBrdf, ...]
@@ -83,7 +87,42 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
     region: np.ndarray
     member: np.ndarray
     components: int
+    modes: int
     system: ClassVar[str] = "transfer"
+
+    @property
+    def spectrum(self) -> tuple[np.ndarray, np.ndarray]:
+        """Matrix from the columns of the light to ones that matter alike, and its inverse."""
+        raise NotImplementedError
+
+    @functools.cached_property
+    def reduced(self) -> tuple[tuple[np.ndarray, ...], np.ndarray | None]:
+        """Responses to fewer modes of the light, and the matrix from these modes to the light, None without need.
+
+        The modes are principal components of the responses, fewer than the texels of the light, and gathering takes as
+        much less time. Lamps are modes of their own.
+        """
+        forward, inverse = self.spectrum
+        texels, count = len(forward), self.modes * 3 // 2
+        if count >= texels:
+            return self.response, None
+        square = np.zeros((texels, texels))
+        for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
+            strength = np.sqrt(np.mean(np.square(np.asarray(basis.view_map, np.float64)), (1, 2, 3)))
+            vertices = len(self.vertices_of(number))
+            sample = np.unique(np.linspace(0, vertices - 1, min(_SAMPLE, vertices)).astype(int))
+            rows = response[sample, :, :texels] @ forward.T.astype(np.float32) * strength[:, None].astype(np.float32)
+            size = np.sum(rows**2, (1, 2), dtype=np.float64)
+            size = np.sqrt(size + _DIM**2 * max(np.mean(size), np.finfo(np.float32).tiny))
+            flat = (rows / size[:, None, None].astype(np.float32)).reshape(-1, texels)
+            square += flat.T @ flat
+        mode = np.linalg.eigh(square)[1][:, : -count - 1 : -1]
+        lamps = np.eye(self.response[0].shape[2] - texels)
+        onto, back = (
+            scipy.linalg.block_diag(matrix, lamps).astype(np.float32)
+            for matrix in (forward.T @ mode, mode.T @ inverse.T)
+        )
+        return tuple((row.reshape(-1, len(onto)) @ onto).reshape(*row.shape[:2], -1) for row in self.response), back
 
     @property
     def header(self) -> Mapping[str, Any]:
@@ -92,7 +131,7 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
         made = visibility.blocks.fingerprint(*(np.asarray(each, np.int64) for each in (self.region, self.member)))
         kinds = self.response[0].shape[2]
         lamps = {"lamps": self.lamps} if self.lamps else {}
-        own = {"kinds": kinds, "maps": maps, "made": made, "components": self.components} | lamps
+        own = {"kinds": kinds, "maps": maps, "made": made, "components": self.components, "modes": self.modes} | lamps
         return self.made_by(self.system, ALGORITHM, **own)
 
     @property
@@ -114,11 +153,11 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
         found = gather.rays(self.rays, self.start[part], self.frame[part, 2], self.frame, self.region, size=self.size)
         way = np.asarray(cubemap.direction(size=self.size), np.float32).reshape(-1, 3)
         share, cosine = gather.shares(self.frame[part, 2], size=self.size), gather.cosines(self.frame[part, 2])
-        result, surfaces = [], {}
+        result, surfaces, (reduced, back) = [], {}, self.reduced
         for number, kind in enumerate(self.basis.tolist()):
-            basis, response = self.bases[kind], self.response[kind]
+            basis, response = self.bases[kind], reduced[kind]
             if number not in found:
-                shape = (len(part), cosine.shape[-1], basis.view_map.shape[-1], response.shape[2])
+                shape = (len(part), cosine.shape[-1], basis.view_map.shape[-1], self.response[kind].shape[2])
                 result.append(np.zeros(shape, np.float32))
                 continue
             rays = found[number]
@@ -140,7 +179,8 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
                 block = slice(first, first + _GROUPS)
                 fixed = (owner, local[corner], weight, way[texel], measure)
                 arrived = gather.arrive(arrived, *surface, *jax.device_put(tuple(each[block] for each in fixed)))
-            result.append(np.asarray(arrived)[: len(part)])
+            rows = np.asarray(arrived)[: len(part)]
+            result.append(rows if back is None else (rows.reshape(-1, len(back)) @ back).reshape(*rows.shape[:3], -1))
         return np.concatenate(result, 2)
 
     def lamp_layout(self, *functions: int) -> Mapping[str, Layout]:
@@ -169,18 +209,12 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
 
 @dataclass(frozen=True)
 class TransferJob(_PathJob):
-    """Tensors of one bounce.
-
-    Attributes:
-        modes: Number of principal components over the light.
-    """
-
-    modes: int
+    """Tensors of one bounce."""
 
     @property
-    def header(self) -> Mapping[str, Any]:
-        """What the result depends on."""
-        return {**super().header, "modes": self.modes}
+    def spectrum(self) -> tuple[np.ndarray, np.ndarray]:
+        """Matrix from texels to wavelets under a natural power spectrum, and its inverse."""
+        return _spectrum(self.response[0].shape[2] - self.lamps)
 
     @property
     def layout(self) -> Mapping[str, Layout]:
@@ -261,7 +295,8 @@ class TransferJob(_PathJob):
                     made = gather.respond_again(arriving, jnp.asarray(self.frame[member]), basis)
                     response[number][local[member[own]]] = np.asarray(made)[own].swapaxes(1, 2)
         same = {field.name: getattr(self, field.name) for field in fields(_PathJob)}
-        return AgainJob(**{**same, "response": tuple(response), "components": components}, function=function)
+        changed = {"response": tuple(response), "components": components, "size": max(self.size // 2, 1)}
+        return AgainJob(**{**same, **changed}, function=function)
 
 
 @dataclass(frozen=True)
@@ -274,6 +309,13 @@ class AgainJob(_PathJob):
 
     function: np.ndarray
     system: ClassVar[str] = "transfer 2"
+
+    @property
+    def spectrum(self) -> tuple[np.ndarray, np.ndarray]:
+        """Scales of the functions that send the light of each texel, as a matrix, and its inverse."""
+        functions = len(self.function)
+        scale = np.tile(self.scale[self.function], self.response[0].shape[2] // functions - self.lamps)
+        return np.diag(scale), np.diag(1 / scale)
 
     @property
     def header(self) -> Mapping[str, Any]:
