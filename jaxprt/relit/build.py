@@ -128,7 +128,7 @@ def precompute(
     options = {"size": size, "executor": executor, "progress": progress}
     counts = [len(part.mesh.position) for part in scene.parts]
     parts = groups.kinds(shadings, recipes)
-    place = groups.Place.of(counts, parts, [recipes[own[0]].joins for own in parts])
+    place = groups.Place.of(counts, parts, [recipes[members[0]].joins for members in parts])
     names = [_file_name(members, scene) for members in place.parts]
     targets = [Target(mesh, path=folder and folder / name, **options) for name in names]
     systems = _systems(recipes, shadings, targets, place)
@@ -139,8 +139,8 @@ def precompute(
         target = Target(mesh, path=folder and folder / "scene", **options)
         lamp = lit and lit.transport(place)
         reflected = reflection.make(shadings, place, bounces, target, lamp=lamp, systems=systems if rays else None)
-    given = {"lamps": lit, "rays": rays, "division": divided, "copied": copied}
-    return RelitScene(scene, shadings, place, systems, reflected, **given)
+    fields = {"lamps": lit, "rays": rays, "division": divided, "copied": copied}
+    return RelitScene(scene, shadings, place, systems, reflected, **fields)
 
 
 def shaded(parts: Sequence[Part], recipes: Sequence[Recipe]) -> list[Shading]:
@@ -199,27 +199,27 @@ def _planned(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
 
 
 def _plan(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
-    kept = folder and folder / "plan"
-    if kept is not None and kept.exists():
-        found, environments = objects.load(kept), options["environments"]
-        if not isinstance(found, Plan):
+    store = folder and folder / "plan"
+    if store is not None and store.exists():
+        stored, environments = objects.load(store), options["environments"]
+        if not isinstance(stored, Plan):
             raise ValueError(f"{kept} is damaged: it must hold a plan, got a {type(found).__name__}")
-        if found.key != key_of(centered(scene), lights_of(scene) if environments is None else environments):
+        if stored.key != key_of(centered(scene), lights_of(scene) if environments is None else environments):
             raise ValueError(f"{kept} was made for another scene, other materials or other lights: name another path")
         asked = ERROR if options["error"] is None else options["error"]
-        if (found.asked, found.rate) != (asked, options["rate"]):
+        if (stored.asked, stored.rate) != (asked, options["rate"]):
             raise ValueError(
                 f"{kept} was made for an error of {found.asked:g} at {found.rate:g} frames per second, "
                 f"got {asked:g} at {options['rate']:g}: name another path"
             )
-        if options["error"] is None or found.error * MARGIN <= asked:
-            return found
-    made = plan(scene, refine=False, path=folder and folder / "candidates", **options)
+        if options["error"] is None or stored.error * MARGIN <= asked:
+            return stored
+    planned = plan(scene, refine=False, path=folder and folder / "candidates", **options)
     if options["progress"]:
-        tqdm.tqdm.write(str(made))
-    if kept is not None:
-        objects.save(kept, made)
-    return made
+        tqdm.tqdm.write(str(planned))
+    if store is not None:
+        objects.save(store, planned)
+    return planned
 
 
 def _recipes(system: str | Recipe | Mapping[str, str | Recipe], scene: Scene) -> list[Recipe]:

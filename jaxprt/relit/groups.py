@@ -91,7 +91,7 @@ def sampled(surface: Surface, samples: int) -> Surface:
     return surface if system is surface.system else dataclasses.replace(surface, system=system)
 
 
-class Given(eqx.Module):
+class VertexMaterials(eqx.Module):
     """Materials that users give at the vertices of some parts of a group, in place of evaluated ones.
 
     Attributes:
@@ -127,17 +127,17 @@ class Place(eqx.Module):
             parts: Indices of the parts of each group.
             joins: Whether the recipe of each group joins parts.
         """
-        exact = [sum(counts[number] for number in own) for own in parts]
+        exact = [sum(counts[number] for number in members) for members in parts]
         pairs = zip(exact, joins, strict=True)
         size = [max(shared_size(count), _FEWEST) if padded else count for count, padded in pairs]
-        return cls(tuple(counts), tuple(tuple(own) for own in parts), tuple(size))
+        return cls(tuple(counts), tuple(tuple(members) for members in parts), tuple(size))
 
     @cached_property
     def group(self) -> Int[np.ndarray, " n"]:
         """Group of each part."""
         result = np.empty(len(self.counts), np.int32)
-        for number, own in enumerate(self.parts):
-            result[list(own)] = number
+        for number, members in enumerate(self.parts):
+            result[list(members)] = number
         return result
 
     @cached_property
@@ -149,8 +149,8 @@ class Place(eqx.Module):
     def start(self) -> Int[np.ndarray, " n"]:
         """Index of the first vertex of each part in its group."""
         result = np.empty(len(self.counts), np.int32)
-        for own in self.parts:
-            result[list(own)] = np.cumsum([0, *(self.counts[number] for number in own)])[:-1]
+        for members in self.parts:
+            result[list(members)] = np.cumsum([0, *(self.counts[number] for number in members)])[:-1]
         return result
 
     @cached_property
@@ -176,20 +176,20 @@ class Place(eqx.Module):
 
     def gathered(self, number: int, appearances: Sequence[Appearance]) -> Appearance:
         """The appearance of a group from those of all parts."""
-        own = [appearances[part] for part in self.parts[number]]
+        members = [appearances[part] for part in self.parts[number]]
         emitted = None
-        if any(each.emitted is not None for each in own):
+        if any(look.emitted is not None for look in members):
             none = [np.zeros((self.counts[part], 3), jnp.result_type(float)) for part in self.parts[number]]
-            pairs = zip(own, none, strict=True)
-            emitted = self.column(number, [zero if each.emitted is None else each.emitted for each, zero in pairs])
-        if own[0].blend is None:
+            pairs = zip(members, none, strict=True)
+            emitted = self.column(number, [zero if look.emitted is None else look.emitted for look, zero in pairs])
+        if members[0].blend is None:
             return Appearance(None, emitted)
-        blends = [each.blend for each in own if each.blend is not None]
+        blends = [look.blend for look in members if look.blend is not None]
         colors = max(blend.weight.shape[2] for blend in blends)
         wide = [_colored(blend.weight, colors) for blend in blends]
         parameter = zip(*(blend.parameter for blend in blends), strict=True)
-        each = tuple(self.column(number, rows) for rows in parameter)
-        return Appearance(Blend(self.column(number, wide), each), emitted)
+        columns = tuple(self.column(number, rows) for rows in parameter)
+        return Appearance(Blend(self.column(number, wide), columns), emitted)
 
 
 def _colored(weight: Any, colors: int) -> Any:
@@ -241,7 +241,7 @@ class Stage(eqx.Module):
         surfaces: One `Surface` for each group.
         table: The materials of all parts.
         rough: The roughness of all parts alone, where JAX traces other parameters; None where the table is known.
-        given: For each group, materials that users give at vertices; None without.
+        fixed: For each group, materials that users give at vertices; None without.
         bend: Curvature of the radiance of each vertex, from `curvature.of_part`.
         place: Where the vertices of the parts stand.
         samples: Number of sample points along the edge of each bright texel, for each part.
@@ -257,7 +257,7 @@ class Stage(eqx.Module):
     surfaces: tuple[Surface, ...]
     table: MaterialTable
     rough: MaterialTable | None
-    given: tuple[Given | None, ...]
+    fixed: tuple[VertexMaterials | None, ...]
     bend: Float[Array, " v"]
     place: Place
     samples: tuple[int, ...] = eqx.field(static=True)
@@ -301,14 +301,14 @@ class Stage(eqx.Module):
             return put(flag[np.asarray(points.corner)[0]])
         return jnp.asarray(flag)[points.corner[0]]
 
-    def blend(self, number: int, points: Points, own: Points) -> tuple[Blend | None, Points]:
-        """Weights of the channels of a group's BRDF at points of the scene, which are `own` on the group.
+    def blend(self, number: int, points: Points, on_group: Points) -> tuple[Blend | None, Points]:
+        """Weights of the channels of a group's BRDF at points of the scene, which are `on_group` on the group.
 
-        The second result is `own` with the normals of normal maps.
+        The second result is `on_group` with the normals of normal maps.
         """
         look = look_at(self.table, self.rough, points)
-        with compile_time(look, own, self.given[number], self.surfaces[number].scale):
-            return material(self.surfaces[number], own, look, self.given[number])[0], own.tilted(look.normal)
+        with compile_time(look, on_group, self.fixed[number], self.surfaces[number].scale):
+            return material(self.surfaces[number], on_group, look, self.fixed[number])[0], on_group.tilted(look.normal)
 
 
 def light(surfaces: Sequence[Surface], bounces: GroupBounces | None, environment: Environment) -> SceneLight:
@@ -318,13 +318,13 @@ def light(surfaces: Sequence[Surface], bounces: GroupBounces | None, environment
 
 def direct(surfaces: Sequence[Surface], environment: Environment) -> tuple[PyTree, ...]:
     """Projects an environment for the systems of all groups. Systems with the same `shared_light` share one result."""
-    made: dict[Any, PyTree] = {}
+    shared: dict[Any, PyTree] = {}
     result = []
-    for own in surfaces:
-        key = own.system.shared_light
-        lit = own.system.light(environment) if key is None or key not in made else made[key]
+    for surface in surfaces:
+        key = surface.system.shared_light
+        lit = surface.system.light(environment) if key is None or key not in shared else shared[key]
         if key is not None:
-            made[key] = lit
+            shared[key] = lit
         result.append(lit)
     return tuple(result)
 
@@ -333,9 +333,9 @@ def kinds(shadings: Sequence[Shading], recipes: Sequence[Any]) -> list[list[int]
     """Indices of the parts of each group: parts with one BRDF and one recipe, if the recipe joins parts."""
     result: list[list[int]] = []
     for number, (shading, recipe) in enumerate(zip(shadings, recipes, strict=True)):
-        for own in result:
-            if recipe.joins and recipes[own[0]] == recipe and alike(shadings[own[0]], shading):
-                own.append(number)
+        for members in result:
+            if recipe.joins and recipes[members[0]] == recipe and alike(shadings[members[0]], shading):
+                members.append(number)
                 break
         else:
             result.append([number])
@@ -348,8 +348,8 @@ def alike(one: Shading, other: Shading) -> bool:
         return one.table is other.table
     if (one.blend is None) != (other.blend is None) or one.term != other.term or len(one.knot) != len(other.knot):
         return False
-    leaves, kind = zip(*(jax.tree.flatten((each.brdf, each.knot)) for each in (one, other)), strict=True)
-    if kind[0] != kind[1] or not all(eqx.is_array(leaf) for own in leaves for leaf in own):
+    leaves, kind = zip(*(jax.tree.flatten((shading.brdf, shading.knot)) for shading in (one, other)), strict=True)
+    if kind[0] != kind[1] or not all(eqx.is_array(leaf) for arrays in leaves for leaf in arrays):
         return False
     return all(np.shape(a) == np.shape(b) and np.array_equal(a, b) for a, b in zip(*leaves, strict=True))
 
@@ -404,7 +404,9 @@ def surface(
     if system.placement is not None:
         position, frame = put(system.placement)
     else:
-        pairs = [(np.asarray(own.mesh.position, dtype), frames(own.mesh.normal, own.mesh.tangent)) for own in members]
+        pairs = [
+            (np.asarray(part.mesh.position, dtype), frames(part.mesh.normal, part.mesh.tangent)) for part in members
+        ]
         position, frame = (
             jax.device_put(place.column(number, rows).astype(dtype)) for rows in zip(*pairs, strict=True)
         )
@@ -417,8 +419,8 @@ def spread(values: Sequence[Any], counts: Sequence[int], size: int, dtype: Any) 
     part = np.repeat(np.arange(len(counts)), counts)
     part = np.pad(part, (0, max(size - len(part), 0)), mode="edge")
     if known(values):
-        return put(np.asarray([float(each) for each in values], dtype)[part])
-    return jnp.stack([jnp.asarray(each, dtype) for each in values])[part]
+        return put(np.asarray([float(value) for value in values], dtype)[part])
+    return jnp.stack([jnp.asarray(value, dtype) for value in values])[part]
 
 
 def padded(mesh: Mesh) -> Mesh:
@@ -437,8 +439,8 @@ def padded(mesh: Mesh) -> Mesh:
 @jit
 def ordered(colors: tuple[Float[Array, "_ _"], ...], order: Int[Array, " v"]) -> Float[Array, "v c"]:
     """Colors of all vertices in the order of the scene, from those of the groups."""
-    most = max(each.shape[1] for each in colors)
-    return jnp.concatenate([jnp.broadcast_to(each, (len(each), most)) for each in colors])[order]
+    most = max(rows.shape[1] for rows in colors)
+    return jnp.concatenate([jnp.broadcast_to(rows, (len(rows), most)) for rows in colors])[order]
 
 
 def look_at(table: MaterialTable, rough: MaterialTable | None, points: Points) -> MaterialLook:
@@ -460,7 +462,7 @@ def look_at(table: MaterialTable, rough: MaterialTable | None, points: Points) -
 
 @jit
 def material(
-    surface: Surface, points: Points, look: MaterialLook, given: Given | None
+    surface: Surface, points: Points, look: MaterialLook, fixed: VertexMaterials | None
 ) -> tuple[Blend | None, Float[Array, "p 3"]]:
     """Weights of the channels at points of a group, and the radiance that they emit.
 
@@ -468,13 +470,13 @@ def material(
         surface: The group.
         points: The points.
         look: The materials at the points.
-        given: Materials that users give at vertices.
+        fixed: Materials that users give at vertices; None without.
     """
     blend = surface.blend(look)
-    if given is None or blend is None:
+    if fixed is None or blend is None:
         return blend, jnp.asarray(look.emitted)
-    own = points.carry(given.flag) > 0.5  # All corners belong to one part.
-    weight = jnp.where(own[:, None, None], points.carry(given.blend.weight), blend.weight)
-    pairs = zip(given.blend.parameter, blend.parameter, strict=True)
-    parameter = tuple(jnp.where(own, points.carry(one), other) for one, other in pairs)
-    return Blend(weight, parameter), jnp.where(own[:, None], points.carry(given.emitted), look.emitted)
+    flag = points.carry(fixed.flag) > 0.5  # All corners belong to one part.
+    weight = jnp.where(flag[:, None, None], points.carry(fixed.blend.weight), blend.weight)
+    pairs = zip(fixed.blend.parameter, blend.parameter, strict=True)
+    parameter = tuple(jnp.where(flag, points.carry(one), other) for one, other in pairs)
+    return Blend(weight, parameter), jnp.where(flag[:, None], points.carry(fixed.emitted), look.emitted)

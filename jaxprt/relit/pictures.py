@@ -40,13 +40,13 @@ class Row(eqx.Module):
         samples: Number of sample points along the edge of each bright texel.
         index: Indices of the points among all points of the picture; -1 is padding. Inside of `jax.jit` these are all
             rows of the group.
-        kept: What does not depend on the light; None if it is computed anew for each light.
+        viewed: What does not depend on the light; None if it is computed anew for each light.
     """
 
     number: int = eqx.field(static=True)
     samples: int = eqx.field(static=True)
     index: Int[Array | np.ndarray, "*m p"]
-    kept: Viewed | None
+    viewed: Viewed | None
 
 
 class PictureView(eqx.Module):
@@ -155,9 +155,9 @@ def _color(
     surface = sampled(picture.stage.surfaces[row.number], row.samples)
     if row.index.ndim == 2:  # of a view that was made inside of `jax.jit`
         return _color_of_some(picture, row, arriving, light)
-    if isinstance(row.kept, Viewed):
+    if isinstance(row.viewed, Viewed):
         texels = _texels(row, light, row.index)
-        return radiance(surface, arriving.at(row.number), row.kept, texels=texels, reflections=reflections)
+        return radiance(surface, arriving.at(row.number), row.viewed, texels=texels, reflections=reflections)
     shade = partial(_shaded, picture, surface, row, row.index, lamps)
     return (jax.checkpoint(shade) if recompute else shade)(arriving, light, reflections)
 
@@ -247,11 +247,11 @@ def make(
             transport = None if lamps is None else lamps.row(row.number, index, on_group)
             if stores:
                 seen = _seen(stage, surface, row.number, points, on_group, camera, lamps=transport)
-                row = dataclasses.replace(row, kept=seen)
+                row = dataclasses.replace(row, viewed=seen)
             if row.number in sharp:
-                blend, own = stage.blend(row.number, points, on_group)
+                blend, tilted = stage.blend(row.number, points, on_group)
                 narrow = stage.sharp_at(row.number, points)
-                origins.append(tracing.RayOrigins(row.number, points, own, blend, narrow, transport))
+                origins.append(tracing.RayOrigins(row.number, points, tilted, blend, narrow, transport))
         complete.append(row)
     reflected = tracing.trace(stage, origins, jnp.asarray(camera.eye), keep=keep) if origins else None
     ray = raster.ray_direction(camera)
@@ -269,15 +269,15 @@ def _seen(
     surface: Surface,
     number: int,
     points: Points,
-    own: Points,
+    on_group: Points,
     camera: Camera,
     lamps: LampTransport | None = None,
 ) -> Viewed:
     """What does not depend on the light, for a row of points with their materials."""
-    look = look_at(stage.table, stage.rough, points)
-    given, sharp = stage.given[number], stage.sharp_at(number, points)
+    look, eye = look_at(stage.table, stage.rough, points), jnp.asarray(camera.eye)
+    options = {"fixed": stage.fixed[number], "sharp": stage.sharp_at(number, points), "lamps": lamps}
     # The view does not depend on the samples of bright texels.
-    return view(sampled(surface, 1), own, look, jnp.asarray(camera.eye), given=given, sharp=sharp, lamps=lamps)
+    return view(sampled(surface, 1), on_group, look, eye, **options)
 
 
 @partial(jit, static_argnames="fold")

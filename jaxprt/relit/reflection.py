@@ -73,7 +73,7 @@ def make(
     Returns:
         The system of reflected light alone.
     """
-    first = [shadings[own[0]] for own in place.parts]
+    first = [shadings[members[0]] for members in place.parts]
     of_group = [paths.factored(shading) for shading in first]
     typical = [paths.typical(shading, of_group[group]) for shading, group in zip(shadings, place.group, strict=True)]
     region, members = _regions(place, typical)
@@ -85,7 +85,7 @@ def make(
     options = {"edge": min(_EDGE, target.size), **target.options("bounces")}
     # Omit nothing: the number of bounces is decided, and later materials may reflect more.
     tensor = bounces.precompute(
-        mesh, [each.brdf for each in sent], weights=weights, lamps=lamp, bounces=count, **options
+        mesh, [path.brdf for path in sent], weights=weights, lamps=lamp, bounces=count, **options
     )
     groups = []
     for number, (shading, path) in enumerate(zip(first, of_group, strict=True)):
@@ -182,13 +182,13 @@ def fractions(
     for source in [*sources, lamp] if lamp.any() else sources:
         lit = np.stack(exchange.reflected(source, albedo, bounces=_EACH))
         for part in range(len(shadings)):
-            own = lit[:, region == part]
+            of_part = lit[:, region == part]
             # The ratio is taken over two bounces, because odd and even bounces between two surfaces differ.
-            before, _, last = (float(np.linalg.norm(bounce)) for bounce in own[-3:])
+            before, _, last = (float(np.linalg.norm(bounce)) for bounce in of_part[-3:])
             ratio = min((last / before) ** 0.5, _SLOWEST) if before > 0 else 0.0
-            own = np.concatenate([own[:-1], own[-1:] / (1 - ratio)])
-            whole = max(float(np.linalg.norm(own.sum(0))), 1e-30)
-            left = [float(np.linalg.norm(own[number:].sum(0))) / whole for number in range(1, _EACH + 1)]
+            of_part = np.concatenate([of_part[:-1], of_part[-1:] / (1 - ratio)])
+            whole = max(float(np.linalg.norm(of_part.sum(0))), 1e-30)
+            left = [float(np.linalg.norm(of_part[number:].sum(0))) / whole for number in range(1, _EACH + 1)]
             result[:, part] = np.maximum(result[:, part], np.asarray(left))
     return result
 

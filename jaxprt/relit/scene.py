@@ -20,7 +20,7 @@ from jaxprt.relit import channels, curvature, groups, measuring, pictures, refle
 from jaxprt.relit import lamps as scene_lamps
 from jaxprt.relit.casting import caster
 from jaxprt.relit.channels import Appearance, Changeable, Shading, appearance
-from jaxprt.relit.groups import Arriving, Given, Place, SceneLight, Stage, Surface
+from jaxprt.relit.groups import Arriving, Place, SceneLight, Stage, Surface, VertexMaterials
 from jaxprt.relit.lamps import SceneLamps
 from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.recipes import samples_of
@@ -169,35 +169,37 @@ class RelitScene(System):
     @property
     def file_vertex(self) -> Int[np.ndarray, " _"]:
         """Index in `mesh` of each vertex of the scene before backs were copied and meshes divided, part by part."""
-        own = [np.arange(count - len(copies)) for count, copies in zip(self._whole_counts(), self.copied, strict=True)]
-        return np.concatenate([first + index for first, index in zip(self.place.first, own, strict=True)])
+        vertices = [
+            np.arange(count - len(copies)) for count, copies in zip(self._whole_counts(), self.copied, strict=True)
+        ]
+        return np.concatenate([first + index for first, index in zip(self.place.first, vertices, strict=True)])
 
     def _whole_counts(self) -> list[int]:
         """Number of vertices of each part with copies for its back, before its mesh was divided."""
         return list(self.place.counts if self.division is None else self.division.counts)
 
-    def _divided(self, number: int, given: Blend | Appearance) -> Blend | Appearance:
+    def _divided(self, number: int, material: Blend | Appearance) -> Blend | Appearance:
         """Materials at the vertices of a part, copied and interpolated to the added ones if they are of the file's."""
         counts, copies = self._whole_counts(), self.copied[number]
         count = counts[number] - len(copies)
-        rows = {len(leaf) for leaf in jax.tree.leaves(given) if np.ndim(leaf)}
+        rows = {len(leaf) for leaf in jax.tree.leaves(material) if np.ndim(leaf)}
         if count == self.place.counts[number] or rows != {count}:
-            return given
+            return material
         parents = [] if self.division is None else subdivision.part_parents(counts, self.division.parent)[number]
         source = np.concatenate([np.arange(count), copies])
-        return jax.tree.map(lambda leaf: jnp.asarray(subdivision.spread(leaf[source], parents)), given)
+        return jax.tree.map(lambda leaf: jnp.asarray(subdivision.spread(leaf[source], parents)), material)
 
     def without_bounces(self) -> "RelitScene":
         """The scene without light that its parts reflect onto each other."""
-        surfaces = tuple(dataclasses.replace(own, reflecting=None) for own in self.surfaces)
+        surfaces = tuple(dataclasses.replace(surface, reflecting=None) for surface in self.surfaces)
         return self._replaced(surfaces=surfaces, bounces=None)
 
     def _replaced(self, **fields: Any) -> "RelitScene":
         """A copy with other fields. Works inside `jax.jit` too, where `__init__` could not measure the curvature."""
-        made = object.__new__(RelitScene)
+        copy = object.__new__(RelitScene)
         for field in dataclasses.fields(self):
-            object.__setattr__(made, field.name, fields.get(field.name, getattr(self, field.name)))
-        return made
+            object.__setattr__(copy, field.name, fields.get(field.name, getattr(self, field.name)))
+        return copy
 
     @promoted
     def light(self, environment: Environment) -> SceneLight:
@@ -211,14 +213,14 @@ class RelitScene(System):
     def shade(self, light: SceneLight, materials: Mapping[str, Any] | None = None) -> Arriving:
         """The light that arrives at all groups, given the materials. Redone when the light or the materials change."""
         require.kind("the light", light, SceneLight, source="RelitScene.light")
-        given, changed = scene_lamps.split(self.lamps, materials)
-        appearances = self.appearances(given)
-        blends = [each.blend for each in self._gathered(appearances)]
+        of_parts, changed = scene_lamps.split(self.lamps, materials)
+        appearances = self.appearances(of_parts)
+        blends = [look.blend for look in self._gathered(appearances)]
         pairs = zip(self.surfaces, light.direct, blends, strict=True)
-        direct = tuple(own.system.shade(lit, blend) for own, lit, blend in pairs)
+        direct = tuple(surface.system.shade(lit, blend) for surface, lit, blend in pairs)
         if self.table.frame is not None:
-            every = zip(self.surfaces, direct, strict=True)
-            direct = tuple(own.system.tilted(lit, own.frame[:, 2]) for own, lit in every)
+            pairs = zip(self.surfaces, direct, strict=True)
+            direct = tuple(surface.system.tilted(lit, surface.frame[:, 2]) for surface, lit in pairs)
         lamp = None if self.lamps is None else self.lamps.radiance(self._all(appearances), changed)
         reflected = None if self.bounces is None else self.bounces.shade(light.transferred, blends, lamp)
         return Arriving(direct, reflected, lamp)
@@ -234,13 +236,13 @@ class RelitScene(System):
                 `jaxprt.relit.channels.appearance`.
         """
         eye = require.position("the eye", origins.local("the eye", eye, self.mesh.origin))
-        given = scene_lamps.split(self.lamps, materials)[0]
-        appearances = self.appearances(given)
-        stage, every = self._stage(given, appearances), self._gathered(appearances)
+        of_parts = scene_lamps.split(self.lamps, materials)[0]
+        appearances = self.appearances(of_parts)
+        stage, looks = self._stage(of_parts, appearances), self._gathered(appearances)
         views, starts = [], []
-        for number, (surface, own) in enumerate(zip(stage.surfaces, every, strict=True)):
+        for number, (surface, look) in enumerate(zip(stage.surfaces, looks, strict=True)):
             points, place = self._points(number, stage)
-            blend = own.blend if place is None or own.blend is None else jax.tree.map(place.carry, own.blend)
+            blend = look.blend if place is None or look.blend is None else jax.tree.map(place.carry, look.blend)
             sharp = None
             if number in stage.sharp_groups:
                 sharp = stage.sharp_at(number, points)
@@ -249,7 +251,7 @@ class RelitScene(System):
                     with compile_time(self.mesh, eye):
                         sharp = sharp * tracing.facing(self.mesh, eye)[points.corner[0]] * self._real(number)
                 starts.append(tracing.RayOrigins(number, points, place, blend, sharp, at_vertices=self.points is None))
-            emitted = own.emitted if place is None or own.emitted is None else place.carry(own.emitted)
+            emitted = look.emitted if place is None or look.emitted is None else place.carry(look.emitted)
             views.append(Viewed(place, view_of(surface, eye, blend, place, sharp), emitted))
         reflected = tracing.trace(stage, starts, eye, keep=True) if starts else None
         return SceneView(tuple(views), stage, reflected)
@@ -288,15 +290,15 @@ class RelitScene(System):
         if self.points is None:
             vertex = self.place.column(number, [self.place.vertices(number)])
             return material_table.at_vertices(vertex.astype(np.int32)), None
-        own = [self.points[part] for part in parts]
-        xp = np if known(own) else jnp
-        corner = [each.corner + self.place.start[part] for each, part in zip(own, parts, strict=True)]
-        in_scene = [each.corner + self.place.first[part] for each, part in zip(own, parts, strict=True)]
-        weight = xp.concatenate([each.weight for each in own], 1)
-        slopes: list[Any] = [each.slope for each in own]
-        slope = None if any(each is None for each in slopes) else xp.concatenate(slopes, 2)
-        pairs = (xp.concatenate(each, 1) for each in (in_scene, corner))
-        scene, group = (Points(jnp.asarray(each), jnp.asarray(weight), slope) for each in pairs)
+        placed = [self.points[part] for part in parts]
+        xp = np if known(placed) else jnp
+        corner = [points.corner + self.place.start[part] for points, part in zip(placed, parts, strict=True)]
+        in_scene = [points.corner + self.place.first[part] for points, part in zip(placed, parts, strict=True)]
+        weight = xp.concatenate([points.weight for points in placed], 1)
+        slopes: list[Any] = [points.slope for points in placed]
+        slope = None if any(rows is None for rows in slopes) else xp.concatenate(slopes, 2)
+        corners = (xp.concatenate(rows, 1) for rows in (in_scene, corner))
+        scene, group = (Points(jnp.asarray(rows), jnp.asarray(weight), slope) for rows in corners)
         return scene, group
 
     def _real(self, number: int) -> Float[np.ndarray, " v"]:
@@ -308,8 +310,8 @@ class RelitScene(System):
         """Index of each vertex or point among those of all groups."""
         if self.points is None:
             return self.place.order()
-        counts = [len(each) for each in self.points]
-        size = [sum(counts[part] for part in own) for own in self.place.parts]
+        counts = [len(points) for points in self.points]
+        size = [sum(counts[part] for part in members) for members in self.place.parts]
         return Place(tuple(counts), self.place.parts, tuple(size)).order()
 
     def _gathered(self, appearances: Mapping[str, Appearance]) -> list[Appearance]:
@@ -317,21 +319,21 @@ class RelitScene(System):
         if not appearances:
             return list(self.appearance)
         names = [part.name for part in self.scene.parts]
-        every, result = self._all(appearances), []
-        for number, own in enumerate(self.place.parts):
-            changed = any(names[part] in appearances for part in own)
-            result.append(self.place.gathered(number, every) if changed else self.appearance[number])
+        looks, result = self._all(appearances), []
+        for number, members in enumerate(self.place.parts):
+            changed = any(names[part] in appearances for part in members)
+            result.append(self.place.gathered(number, looks) if changed else self.appearance[number])
         return result
 
     def _stage(self, materials: Mapping[str, Any] | None, appearances: Mapping[str, Appearance]) -> Stage:
         """The scene with given materials, as pictures and reflections take it."""
-        given, names = dict(materials or {}), [part.name for part in self.scene.parts]
-        new = {name: each for name, each in given.items() if _is_model(each)}
+        of_parts, names = dict(materials or {}), [part.name for part in self.scene.parts]
+        new = {name: material for name, material in of_parts.items() if _is_model(material)}
         table, rough = self._tables(new)
-        fixed = [name in given and name not in new for name in names]
+        fixed = [name in of_parts and name not in new for name in names]
         unchanged = Appearance(None)
         changed = [appearances.get(name, unchanged) for name in names]
-        at_vertices = [self._given(number, fixed, changed) for number in range(len(self.surfaces))]
+        at_vertices = [self._vertex_materials(number, fixed, changed) for number in range(len(self.surfaces))]
         bend, samples, sharp = self._traits(changed)
         surfaces = [self._surface(number, sharp) for number in range(len(self.surfaces))]
         emitting = {} if self.lamps is None else {part: lamp for lamp, part in enumerate(self.lamps.emitting)}
@@ -358,12 +360,12 @@ class RelitScene(System):
         if not new:
             return self.table, None
         before = [part.material for part in self.scene.parts]
-        every = [new.get(part.name, part.material) for part in self.scene.parts]
-        table = put(material_table.with_materials(self.table, every, before))
+        after = [new.get(part.name, part.material) for part in self.scene.parts]
+        table = put(material_table.with_materials(self.table, after, before))
         if known(table):
             return table, None
         with compile_time():
-            plain = [channels.rough(material) for material in every]
+            plain = [channels.rough(material) for material in after]
             if not known(plain, self.table):
                 return table, None
             return table, put(material_table.with_materials(self.table, plain, before))
@@ -371,10 +373,10 @@ class RelitScene(System):
     def _traits(self, appearances: Sequence[Appearance]) -> tuple[list, tuple[int, ...], tuple[bool, ...]]:
         """Curvature of each part's radiance, samples of bright texels, and whether its reflections are traced."""
         rows = list(zip(self.curvature, self.samples, self.sharp, strict=True))
-        for part, (given, shading) in enumerate(zip(appearances, self.shading, strict=True)):
-            if given.blend is not None and shading.table is not None and known(given):
+        for part, (look, shading) in enumerate(zip(appearances, self.shading, strict=True)):
+            if look.blend is not None and shading.table is not None and known(look):
                 number = self.place.group[part]
-                new = dataclasses.replace(shading, blend=given.blend)
+                new = dataclasses.replace(shading, blend=look.blend)
                 rows[part] = traits(new, self.surfaces[number])
         bend, samples, sharp = zip(*rows, strict=True)
         return list(bend), samples, sharp
@@ -386,18 +388,20 @@ class RelitScene(System):
             return surface.without_rays
         return dataclasses.replace(surface, reflecting=dataclasses.replace(surface.reflecting, count=self.rays))
 
-    def _given(self, number: int, fixed: Sequence[bool], appearances: Sequence[Appearance]) -> Given | None:
+    def _vertex_materials(
+        self, number: int, fixed: Sequence[bool], appearances: Sequence[Appearance]
+    ) -> VertexMaterials | None:
         """Materials that users give at the vertices of some parts of a group; None without."""
-        own = self.place.parts[number]
-        if not any(fixed[part] for part in own) or self.surfaces[number].scale is None:
+        members = self.place.parts[number]
+        if not any(fixed[part] for part in members) or self.surfaces[number].scale is None:
             return None
-        names = {part: appearances[part] if fixed[part] else _precomputed(self.shading[part]) for part in own}
+        names = {part: appearances[part] if fixed[part] else _precomputed(self.shading[part]) for part in members}
         whole = self.place.gathered(number, [names.get(part, Appearance(None)) for part in range(len(fixed))])
         dtype = self.mesh.position.dtype
-        flag = self.place.column(number, [np.full(self.place.counts[part], fixed[part], dtype) for part in own])
+        flag = self.place.column(number, [np.full(self.place.counts[part], fixed[part], dtype) for part in members])
         emitted = np.zeros((self.place.size[number], 3), dtype) if whole.emitted is None else whole.emitted
         assert whole.blend is not None
-        return put(Given(whole.blend, emitted, flag))
+        return put(VertexMaterials(whole.blend, emitted, flag))
 
     @promoted
     def radiance(
@@ -408,8 +412,8 @@ class RelitScene(System):
         materials: Mapping[str, Any] | None = None,
     ) -> Float[Array, "*l v c"]:
         """Radiance that each vertex sends to the eye, including emission; see `jaxprt.radiance`."""
-        given, changed = scene_lamps.split(self.lamps, materials)
-        return protocol.radiance(self, environment, eye=eye, materials={**self.appearances(given), **changed})
+        of_parts, changed = scene_lamps.split(self.lamps, materials)
+        return protocol.radiance(self, environment, eye=eye, materials={**self.appearances(of_parts), **changed})
 
     @property
     def origin(self) -> origins.Origin:
@@ -425,10 +429,10 @@ class RelitScene(System):
         if origin == origins.ZERO:
             return self
         moved = scenes.centered(self.scene), meshes.centered(self.mesh), self.camera.local(origin)
-        result = eqx.tree_at(lambda each: (each.scene, each.mesh, each.camera), self, moved)
+        result = eqx.tree_at(lambda relit: (relit.scene, relit.mesh, relit.camera), self, moved)
         if self.lamps is None:
             return result
-        return eqx.tree_at(lambda each: each.lamps.point_lights, result, result.scene.point_lights)
+        return eqx.tree_at(lambda relit: relit.lamps.point_lights, result, result.scene.point_lights)
 
     @promoted
     def picture(
@@ -561,11 +565,11 @@ class RelitScene(System):
         camera = self.camera if camera is None else camera
         require.function("between", options.get("between"))
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
-        given = scene_lamps.split(self.lamps, materials)[0]
-        if given is not None and not isinstance(given, Mapping):
-            self.appearances(given)  # raises the error
-        appearances = self.appearances(given)
-        stage = self._stage(given, appearances)
+        of_parts = scene_lamps.split(self.lamps, materials)[0]
+        if of_parts is not None and not isinstance(of_parts, Mapping):
+            self.appearances(of_parts)  # raises the error
+        appearances = self.appearances(of_parts)
+        stage = self._stage(of_parts, appearances)
         arriving = _Lit(self, materials, appearances)
         return pictures.make(stage, arriving, camera.local(self.mesh.origin), **options)
 
@@ -621,8 +625,8 @@ class RelitScene(System):
         if unknown:
             raise ValueError(f"materials must be for the parts {names}, got one for {unknown[0]!r}")
         result = {}
-        table, rough = self._tables({name: each for name, each in materials.items() if _is_model(each)})
-        for name, given in materials.items():
+        table, rough = self._tables({name: material for name, material in materials.items() if _is_model(material)})
+        for name, material in materials.items():
             number = names.index(name)
             part, shading = self.scene.parts[number], self.shading[number]
             if shading.blend is None:
@@ -631,15 +635,15 @@ class RelitScene(System):
                     "another one, with a TexturedMaterial, a BlinnPhong or a CookTorrance"
                 )
             kinds, source = (*typing.get_args(Changeable), Appearance, Blend), "jaxprt.scene or RelitScene.appearances"
-            require.kind(f"the material of part {name!r}", given, *kinds, source=source)
-            if _is_model(given):
+            require.kind(f"the material of part {name!r}", material, *kinds, source=source)
+            if _is_model(material):
                 first = int(self.place.first[number])
                 vertex = np.arange(first, first + len(part.mesh.position), dtype=np.int32)
                 look = groups.look_at(table, rough, material_table.at_vertices(vertex))
-                given = appearance(part, shading, given, look=look)
+                material = appearance(part, shading, material, look=look)
             else:
-                given = self._divided(number, given)
-            result[name] = Appearance(given, shading.emitted) if isinstance(given, Blend) else given
+                material = self._divided(number, material)
+            result[name] = Appearance(material, shading.emitted) if isinstance(material, Blend) else material
             _check_blend(name, shading, result[name].blend)
             if not isinstance(result[name].emitted, Tracer | None) and shading.emitted is None:
                 raise ValueError(
@@ -657,8 +661,8 @@ class RelitScene(System):
             TypeError: `points` is not one list of points for each part.
             ValueError: A point is not on a triangle of its part.
         """
-        given = protocol.check_points(points, [len(part.mesh.position) for part in self.scene.parts])
-        return eqx.tree_at(lambda each: each.points, self, given, is_leaf=lambda each: each is None)
+        checked = protocol.check_points(points, [len(part.mesh.position) for part in self.scene.parts])
+        return eqx.tree_at(lambda relit: relit.points, self, checked, is_leaf=lambda leaf: leaf is None)
 
     @property
     def vertices(self) -> int:
@@ -668,7 +672,7 @@ class RelitScene(System):
     @property
     def shared_light(self) -> tuple | None:
         """Key of the light without bounces; None with them. See `System.shared_light`."""
-        keys = tuple(own.system.shared_light for own in self.surfaces)
+        keys = tuple(surface.system.shared_light for surface in self.surfaces)
         return None if None in keys or self.bounces is not None else (RelitScene, *keys)
 
     @property
@@ -702,12 +706,12 @@ def _is_model(material: Any) -> bool:
 
 def _check_blend(name: str, shading: Shading, blend: Blend | None) -> None:
     """Refuses weights of other vertices or channels, and other parameters, than a part has."""
-    own = shading.blend
-    assert own is not None
-    if blend is None or len(blend.parameter) != len(own.parameter):
+    precomputed = shading.blend
+    assert precomputed is not None
+    if blend is None or len(blend.parameter) != len(precomputed.parameter):
         got = "no weights" if blend is None else f"{len(blend.parameter)} parameters"
         raise ValueError(f"the material of part {name!r} must have {len(own.parameter)} parameters, got {got}")
-    blend.check(len(own.weight), own.weight.shape[1])
+    blend.check(len(precomputed.weight), precomputed.weight.shape[1])
 
 
 class _Lit(eqx.Module):

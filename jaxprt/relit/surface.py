@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree, UInt8
 
 from jaxprt.compile import jit, kept
-from jaxprt.relit.groups import Given, Surface, material
+from jaxprt.relit.groups import Surface, VertexMaterials, material
 from jaxprt.scene.material_table import MaterialLook
 from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import directions
@@ -84,7 +84,7 @@ def view(
     look: MaterialLook,
     eye: Float[Array, "*p 3"],
     *,
-    given: Given | None = None,
+    fixed: VertexMaterials | None = None,
     sharp: Float[Array, " p"] | None = None,
     variance: Float[Array, " p"] | None = None,
     glows: bool = True,
@@ -97,7 +97,7 @@ def view(
         points: Points on the group.
         look: The materials at the points.
         eye: Position of the viewer: one, or one for each point.
-        given: Materials that users give at vertices.
+        fixed: Materials that users give at vertices; None without.
         sharp: 1 at points whose narrow lobes are traced by rays, 0 at others; None where no lobe is.
         variance: Variance in squared radians by which lobes are widened, at points that reflection rays hit; see
             `jaxprt.systems.lobe.widened`.
@@ -105,7 +105,7 @@ def view(
         lamps: The transport of the lamps to the points; None to interpolate it between vertices.
     """
     points = points.tilted(look.normal)
-    blend, emitted = material(surface, points, look, given)
+    blend, emitted = material(surface, points, look, fixed)
     seen = view_of(surface, eye, blend, points, sharp, variance=variance, lamps=lamps)
     sight = _sight(surface, points, eye, blend)
     return Viewed(points, seen, emitted if glows else jnp.zeros_like(emitted), sight)

@@ -125,8 +125,8 @@ class Reflections(eqx.Module):
 
 def _viewed(stage: Stage, row: HitRow) -> Viewed:
     """What does not depend on the light, at the hits of a row."""
-    look, given = look_at(stage.table, stage.rough, row.points), stage.given[row.number]
-    options = {"given": given, "variance": row.variance, "glows": False}
+    look = look_at(stage.table, stage.rough, row.points)
+    options = {"fixed": stage.fixed[row.number], "variance": row.variance, "glows": False}
     return view(stage.surfaces[row.number].without_rays, row.on_group, look, row.eye, **options)
 
 

@@ -120,6 +120,6 @@ def test_a_scene_without_normal_maps_has_none_at_its_points():
     flat = prt.precompute(square(**GLOSSY), system=Lobes(lobes=4, texels=8), size=SIZE, progress=False)
     assert flat.table.frame is None
     view = flat.picture_view(CAMERA, samples=1)
-    assert all(row.kept.points.normal is row.kept.sight.above is None for row in view.rows)
+    assert all(row.viewed.points.normal is row.viewed.sight.above is None for row in view.rows)
     with pytest.raises(ValueError, match="normal maps only in scenes that were precomputed with one"):
         flat.picture(light(), CAMERA, materials={"square": TexturedMaterial(normal_texture=tilted(), **GLOSSY)})

@@ -49,8 +49,8 @@ def respond(
 
     def one(argument):
         visible, axes = argument
-        met = _met(axes, basis, size) * (visible / visibility.LEVELS)[:, None].astype(axes.dtype)
-        return jnp.sum(met.reshape(6, edge, fold, edge, fold, -1), (2, 4)).reshape(6 * edge * edge, -1)
+        factor = _met(axes, basis, size) * (visible / visibility.LEVELS)[:, None].astype(axes.dtype)
+        return jnp.sum(factor.reshape(6, edge, fold, edge, fold, -1), (2, 4)).reshape(6 * edge * edge, -1)
 
     return jax.lax.map(one, (seen, frame))
 
@@ -181,14 +181,14 @@ def rays(
     result = {}
     for number in np.unique(region[corner[seen]]).tolist():
         inside = region[corner] == number
-        own = np.flatnonzero(seen & inside.any(1))
-        count = np.bincount(point[own], minlength=len(start))
-        place = np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
+        hit = np.flatnonzero(seen & inside.any(1))
+        count = np.bincount(point[hit], minlength=len(start))
+        place = np.arange(len(hit)) - np.repeat(np.cumsum(count) - count, count)
         groups = -(-count // _HITS)
-        group = (np.cumsum(groups) - groups)[point[own]] + place // _HITS
+        group = (np.cumsum(groups) - groups)[point[hit]] + place // _HITS
         padded = [np.zeros((groups.sum(), _HITS, *x.shape[1:]), x.dtype) for x in (corner, barycentric, texel)]
-        for whole, each in zip(padded, (corner[own], (barycentric * inside)[own], texel[own]), strict=True):
-            whole[group, place % _HITS] = each
+        for whole, rows in zip(padded, (corner[hit], (barycentric * inside)[hit], texel[hit]), strict=True):
+            whole[group, place % _HITS] = rows
         result[number] = Rays(np.repeat(np.arange(len(start)), groups), *padded)
     return result
 
@@ -211,9 +211,9 @@ def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c
     if edge < 1 or size % edge:
         raise ValueError(f"the edge of coarse faces must divide the edge of the light's faces, {size}, got {edge}")
     area, way = cubemap.solid_angle(size=size)[..., None], cubemap.direction(size=size)
-    each = jnp.concatenate([radiance * area, jnp.broadcast_to(area, radiance[..., :1].shape)], -1)
-    shape = jax.ShapeDtypeStruct((6, edge, edge, each.shape[-1]), each.dtype)
-    (total,) = jax.linear_transpose(lambda faces: cubemap.lookup(faces, way), shape)(each)
+    flux = jnp.concatenate([radiance * area, jnp.broadcast_to(area, radiance[..., :1].shape)], -1)
+    shape = jax.ShapeDtypeStruct((6, edge, edge, flux.shape[-1]), flux.dtype)
+    (total,) = jax.linear_transpose(lambda faces: cubemap.lookup(faces, way), shape)(flux)
     return (total[..., :-1] / total[..., -1:]).reshape(6 * edge * edge, -1)
 
 

@@ -128,11 +128,17 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
     def header(self) -> Mapping[str, Any]:
         """What the result depends on."""
         maps = [self.bases[number].coordinates.__name__ for number in self.basis]
-        made = visibility.blocks.fingerprint(*(np.asarray(each, np.int64) for each in (self.region, self.member)))
+        divided = visibility.blocks.fingerprint(*(np.asarray(index, np.int64) for index in (self.region, self.member)))
         kinds = self.response[0].shape[2]
         lamps = {"lamps": self.lamps} if self.lamps else {}
-        own = {"kinds": kinds, "maps": maps, "made": made, "components": self.components, "modes": self.modes} | lamps
-        return self.made_by(self.system, ALGORITHM, **own)
+        about = {
+            "kinds": kinds,
+            "maps": maps,
+            "made": divided,
+            "components": self.components,
+            "modes": self.modes,
+        } | lamps
+        return self.made_by(self.system, ALGORITHM, **about)
 
     @property
     def near(self) -> Mapping[str, list[float]]:
@@ -140,9 +146,9 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
         parts = {"white": self.white, "scale": self.scale}
         for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
             parts |= {f"light {number}": basis.light_map, f"view {number}": basis.view_map}
-            own = response[: len(self.vertices_of(number))]
-            parts |= {f"response {number}": own.swapaxes(1, 2)}  # The order of axes in stores of earlier releases.
-        return {**super().near, **{name: sketch(each) for name, each in parts.items()}}
+            rows = response[: len(self.vertices_of(number))]
+            parts |= {f"response {number}": rows.swapaxes(1, 2)}  # The order of axes in stores of earlier releases.
+        return {**super().near, **{name: sketch(value) for name, value in parts.items()}}
 
     def vertices_of(self, basis: int) -> np.ndarray:
         """Vertices of all regions with the functions of a basis, in the order of its responses."""
@@ -150,17 +156,17 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
 
     def arrived(self, part: np.ndarray) -> Float[np.ndarray, "b s q l"]:
         """Harmonics of the light that arrives at some vertices, before compression."""
-        found = gather.rays(self.rays, self.start[part], self.frame[part, 2], self.frame, self.region, size=self.size)
+        hits = gather.rays(self.rays, self.start[part], self.frame[part, 2], self.frame, self.region, size=self.size)
         way = np.asarray(cubemap.direction(size=self.size), np.float32).reshape(-1, 3)
         share, cosine = gather.shares(self.frame[part, 2], size=self.size), gather.cosines(self.frame[part, 2])
         result, surfaces, (reduced, back) = [], {}, self.reduced
         for number, kind in enumerate(self.basis.tolist()):
             basis, response = self.bases[kind], reduced[kind]
-            if number not in found:
+            if number not in hits:
                 shape = (len(part), cosine.shape[-1], basis.view_map.shape[-1], self.response[kind].shape[2])
                 result.append(np.zeros(shape, np.float32))
                 continue
-            rays = found[number]
+            rays = hits[number]
             if kind not in surfaces:
                 vertex = self.vertices_of(kind)
                 local = np.zeros(len(self.region), np.int32)
@@ -178,7 +184,7 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
             for first in range(0, len(owner), _GROUPS):
                 block = slice(first, first + _GROUPS)
                 fixed = (owner, local[corner], weight, way[texel], measure)
-                arrived = gather.arrive(arrived, *surface, *jax.device_put(tuple(each[block] for each in fixed)))
+                arrived = gather.arrive(arrived, *surface, *jax.device_put(tuple(rows[block] for rows in fixed)))
             rows = np.asarray(arrived)[: len(part)]
             result.append(rows if back is None else (rows.reshape(-1, len(back)) @ back).reshape(*rows.shape[:3], -1))
         return np.concatenate(result, 2)
@@ -201,10 +207,10 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
 
     def brought(self, tensor: Float[np.ndarray, "b l s *q"], part: np.ndarray, white: np.ndarray) -> np.ndarray:
         """Irradiance over pi at each vertex of a part, for given weights of functions, under uniform light."""
-        met = np.sum(tensor, 1)
-        for _ in range(met.ndim - 2):
-            met = met @ white
-        return np.sum(met * gather.cosines(self.frame[part, 2]), 1)
+        light = np.sum(tensor, 1)
+        for _ in range(light.ndim - 2):
+            light = light @ white
+        return np.sum(light * gather.cosines(self.frame[part, 2]), 1)
 
 
 @dataclass(frozen=True)
@@ -250,7 +256,7 @@ class TransferJob(_PathJob):
 
     def without_response(self) -> "TransferJob":
         """The job without responses: about 40 kB for each vertex that are not needed when its blocks are done."""
-        none = tuple(np.zeros((0, *each.shape[1:]), each.dtype) for each in self.response)
+        none = tuple(np.zeros((0, *response.shape[1:]), response.dtype) for response in self.response)
         return replace(self, response=none)
 
     def again(
@@ -290,10 +296,10 @@ class TransferJob(_PathJob):
                 from_lamps = _expand(*jax.device_put((lamp[0][cluster], lamp[1][cluster], np.eye(self.lamps))))
                 arriving = jnp.concatenate([arriving, from_lamps.astype(arriving.dtype)], 1)
             for number, basis in enumerate(self.bases):
-                own = self.basis[self.region[member]] == number
-                if own.any():
-                    made = gather.respond_again(arriving, jnp.asarray(self.frame[member]), basis)
-                    response[number][local[member[own]]] = np.asarray(made)[own].swapaxes(1, 2)
+                here = self.basis[self.region[member]] == number
+                if here.any():
+                    responses = gather.respond_again(arriving, jnp.asarray(self.frame[member]), basis)
+                    response[number][local[member[here]]] = np.asarray(responses)[here].swapaxes(1, 2)
         same = {field.name: getattr(self, field.name) for field in fields(_PathJob)}
         changed = {"response": tuple(response), "components": components, "size": max(self.size // 2, 1)}
         return AgainJob(**{**same, **changed}, function=function)
@@ -350,9 +356,9 @@ class AgainJob(_PathJob):
 
     def tensor(self, part: np.ndarray) -> Float[np.ndarray, "b l s q q"]:
         """The light that arrives at some vertices, before compression."""
-        found = self.arrived(part)[:, :, self.function]
-        found = found.reshape(*found.shape[:3], -1, len(self.function))
-        return found.transpose(0, 3, 1, 4, 2)
+        arrived = self.arrived(part)[:, :, self.function]
+        arrived = arrived.reshape(*arrived.shape[:3], -1, len(self.function))
+        return arrived.transpose(0, 3, 1, 4, 2)
 
 
 def compress(
@@ -431,5 +437,5 @@ def _expand(weight: Array, core: Array, coarse: Array) -> Array:
 
     For lamps, `coarse` is the identity.
     """
-    met = jnp.einsum("le,ensq->nslq", coarse, core.astype(weight.dtype))
-    return jnp.einsum("mn,nslq->slqm", weight, met).reshape(core.shape[2], -1, len(weight))
+    sent = jnp.einsum("le,ensq->nslq", coarse, core.astype(weight.dtype))
+    return jnp.einsum("mn,nslq->slqm", weight, sent).reshape(core.shape[2], -1, len(weight))

@@ -267,36 +267,36 @@ def _arriving(
     system: GroupBounces, light: LitTransfer, materials: tuple[Blend | None, ...], lamp: Array | None
 ) -> tuple[Float[Array, "lm _ _"], ...]:
     rows, changes = [], []
-    for own, members, factor, strength, blend in zip(
+    for part, members, factor, strength, blend in zip(
         system.group, system.members, system.factor, system.strength, materials, strict=True
     ):
-        sent, change = _sent(own, members, factor, strength, blend)
+        sent, change = _sent(part, members, factor, strength, blend)
         rows.append(sent.reshape(-1, sent.shape[-1]))
         changes.append(change)
     weight, change = _stacked(rows)[system.order], None
-    if any(each is not None for each in changes):
-        none = [jnp.zeros((len(own.position), 1), own.position.dtype) for own in system.group]
+    if any(rows is not None for rows in changes):
+        none = [jnp.zeros((len(part.position), 1), part.position.dtype) for part in system.group]
         pairs = zip(changes, none, strict=True)
-        change = _stacked([zero if each is None else each for each, zero in pairs])[system.place]
+        change = _stacked([zero if rows is None else rows for rows, zero in pairs])[system.place]
     arriving = collect(system.tensor, light, weight, change=change, lamp=lamp)
     pairs = zip(system.group, system.members, strict=True)
-    return tuple(harmonic.system.local_light(own.frame, arriving[..., members.vertex]) for own, members in pairs)
+    return tuple(harmonic.system.local_light(part.frame, arriving[..., members.vertex]) for part, members in pairs)
 
 
 def _stacked(rows: Sequence[Float[Array, "_ _"]]) -> Float[Array, "_ c"]:
     """Rows one after another. Gray ones are repeated to the colors of the others."""
-    colors = max(each.shape[1] for each in rows)
-    return jnp.concatenate([jnp.broadcast_to(each, (len(each), colors)) for each in rows])
+    colors = max(row.shape[1] for row in rows)
+    return jnp.concatenate([jnp.broadcast_to(row, (len(row), colors)) for row in rows])
 
 
 def _sent(
-    own: ReflectingPart, members: Members, factor: Array, strength: Array | None, blend: Blend | None
+    part: ReflectingPart, members: Members, factor: Array, strength: Array | None, blend: Blend | None
 ) -> tuple[Float[Array, "r q _"], Float[Array, "v c"] | None]:
     """Weights of the functions of each region of a group, and each vertex's albedo minus that of its region's mean."""
     if blend is None:
         return jnp.broadcast_to(factor, (members.regions, *factor.shape)), None
-    blend.check(len(own.position), factor.shape[1] if own.sent is None else own.sent.factor.shape[1])
-    weight = blend.weight if own.sent is None else own.sent.weights(blend)
+    blend.check(len(part.position), factor.shape[1] if part.sent is None else part.sent.factor.shape[1])
+    weight = blend.weight if part.sent is None else part.sent.weights(blend)
     mean = members.mean(weight)
     change = None
     if strength is not None:

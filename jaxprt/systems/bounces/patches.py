@@ -71,7 +71,7 @@ class Patches(eqx.Module):
 
     def albedo(self, function: Int[Array, " q"], weight: Float[Array, "q d"]) -> Float[Array, "j d"]:
         """Mean albedo of the region of each patch, given the weights of the functions that the tensor keeps."""
-        owner = np.repeat(np.arange(len(self.strength)), [len(each) for each in self.strength])
+        owner = np.repeat(np.arange(len(self.strength)), [len(strength) for strength in self.strength])
         strength = jnp.concatenate(self.strength)[function, None] * weight
         of_region = jnp.zeros((len(self.strength), weight.shape[1]), weight.dtype)
         return of_region.at[jnp.asarray(owner)[function]].add(strength)[self.region]
@@ -151,8 +151,8 @@ class Patches(eqx.Module):
         matrix = jnp.eye(len(rho), dtype=rho.dtype) - rho.T[:, :, None] * self.between
         if len(matrix) == 1:
             return jnp.linalg.solve(matrix[0], start)
-        each = jnp.broadcast_to(start, (len(rho), len(matrix))).T[..., None]
-        return jnp.linalg.solve(matrix, each)[..., 0].T
+        right = jnp.broadcast_to(start, (len(rho), len(matrix))).T[..., None]
+        return jnp.linalg.solve(matrix, right)[..., 0].T
 
     def received(self, sent: Float[Array, "j e"]) -> Float[Array, "s e v"]:
         """SH coefficients, in world directions, of the light that arrives at each vertex from all patches."""
@@ -180,8 +180,8 @@ class PatchJob(visibility.rays.VisibilityJob):
     @property
     def header(self) -> dict[str, Any]:
         """What the result depends on."""
-        made = visibility.blocks.fingerprint(np.asarray(self.patch, np.int64))
-        return self.made_by("patches", self.algorithm, patch=made, edge=self.edge)
+        patch = visibility.blocks.fingerprint(np.asarray(self.patch, np.int64))
+        return self.made_by("patches", self.algorithm, patch=patch, edge=self.edge)
 
     @property
     def layout(self) -> dict[str, Layout]:
@@ -237,21 +237,22 @@ class Means(NamedTuple):
 
     def of(self, value: Float[np.ndarray, "v k"]) -> Float[np.ndarray, "j k"]:
         """Means of values of the vertices."""
-        return self._each(lambda own, share: share @ np.asarray(value[own], np.float32), (value.shape[1],))
+        return self._over(lambda vertex, share: share @ np.asarray(value[vertex], np.float32), (value.shape[1],))
 
     def product(self, one: Float[np.ndarray, "v n"], other: Float[np.ndarray, "v s"]) -> Float[np.ndarray, "j n s"]:
         """Means of the products of two kinds of values."""
         shape = one.shape[1], other.shape[1]
-        return self._each(
-            lambda own, share: np.einsum("v,vn,vs->ns", share, one[own], other[own], optimize=True), shape
+        return self._over(
+            lambda vertex, share: np.einsum("v,vn,vs->ns", share, one[vertex], other[vertex], optimize=True), shape
         )
 
-    def _each(self, mean: Callable, shape: tuple[int, ...]) -> np.ndarray:
+    def _over(self, mean: Callable, shape: tuple[int, ...]) -> np.ndarray:
         result = np.zeros((self.patches, *shape), np.float32)
         order = np.argsort(self.patch, kind="stable")
-        for number, own in enumerate(np.split(order, np.searchsorted(self.patch[order], np.arange(1, self.patches)))):
-            whole = self.area[own].sum()
-            result[number] = mean(own, self.area[own] / whole if whole > 0 else self.area[own])
+        ends = np.searchsorted(self.patch[order], np.arange(1, self.patches))
+        for number, vertex in enumerate(np.split(order, ends)):
+            area = self.area[vertex]
+            result[number] = mean(vertex, area / area.sum() if area.sum() > 0 else area)
         return result.astype(np.float32)
 
 
@@ -334,11 +335,11 @@ def divide(
     patch, of_region, of_cluster = np.zeros(len(region), np.int32), [], []
     for number, vertex in enumerate(member):
         vertex = np.unique(vertex)
-        for each in np.unique(region[vertex]).tolist():
-            own = vertex[region[vertex] == each]
-            count = min(len(own), max(1, round(patches * len(own) / len(region))))
-            for part in clustering.bisect(coordinate[own], clusters=count):
-                patch[own[part]] = len(of_region)
-                of_region.append(each)
+        for owner in np.unique(region[vertex]).tolist():
+            inside = vertex[region[vertex] == owner]
+            count = min(len(inside), max(1, round(patches * len(inside) / len(region))))
+            for part in clustering.bisect(coordinate[inside], clusters=count):
+                patch[inside[part]] = len(of_region)
+                of_region.append(owner)
                 of_cluster.append(number)
     return patch, np.asarray(of_region, np.int32), np.asarray(of_cluster, np.int32)

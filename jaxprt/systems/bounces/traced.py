@@ -65,8 +65,8 @@ def albedos(table: LobeBrdf) -> Float[Array, "3 c *k"]:
     # Projected solid angle in the parabolic map, whose radius is the tangent of half the angle.
     area = area * jnp.maximum(1 - radius**2, 0) / (1 + radius**2) ** 3
     traced = jnp.sum(table.weight * traced_share(jnp.exp(table.scale)), 1)
-    every = jnp.stack([traced, jnp.sum(table.weight, 1), table.diffuse])
-    return jnp.sum(every * area, tuple(range(-len(views), 0)))
+    weights = jnp.stack([traced, jnp.sum(table.weight, 1), table.diffuse])
+    return jnp.sum(weights * area, tuple(range(-len(views), 0)))
 
 
 def is_traced(traced: ArrayLike, glossy: ArrayLike, diffuse: ArrayLike) -> Bool[np.ndarray, "*k"]:

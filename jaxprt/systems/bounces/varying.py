@@ -32,7 +32,7 @@ class FunctionWeights(eqx.Module):
 
     def __check_init__(self):
         """Refuses factors for another number of knots."""
-        knots = [len(each) for each in self.knot] or [1]
+        knots = [len(values) for values in self.knot] or [1]
         if list(self.factor.shape[:-2]) != knots:
             raise ValueError(
                 f"the factors must have {knots} rows, one for each knot, got {list(self.factor.shape[:-2])}"
