@@ -127,7 +127,7 @@ def measure(
         own = jnp.asarray(scene.judged[:, None], jnp.float32)
         chosen["floor"] = np.asarray(image.render(scene.mesh, own, scene.camera, background=None)) > 0.99
     sizes = [len(each.mesh.position) for each in scene.shadings]
-    place = Place.of(sizes, [[number] for number in range(len(sizes))], [False] * len(sizes))  # a group for each part
+    place = Place.apart(sizes)
     for count in counts:
         start = time.perf_counter()
         target = Target(scene.mesh, size=16, progress=False)

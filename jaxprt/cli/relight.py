@@ -253,7 +253,7 @@ def _describe(view: View, chosen: SimpleNamespace) -> dict[str, Any]:
         "environments": dict(zip(names, map(str, lights), strict=True)) or "embedded",
         "turn": list(chosen.turn),
         "light_size": next(iter(view.lights.values())).radiance.shape[-2],
-        "vertices": {part.name: len(part.mesh.position) for part in view.scene.parts},
+        "vertices": dict(zip(view.scene.names, view.scene.counts, strict=True)),
         "brdf": {part.name: inputs.describe(part.material) for part in view.scene.parts},
         "camera": {
             name: np.asarray(value).tolist()

@@ -222,12 +222,8 @@ def _points(view: View) -> image.Pixels:
 def visible_vertices(view: View) -> list[np.ndarray]:
     """For each part, the vertices of the triangles in the picture."""
     vertex = np.unique(np.asarray(view.scene.mesh.face)[visible(view)])
-    first = np.cumsum([0, *_counts(view.scene)])
+    first = np.cumsum([0, *view.scene.counts])
     return [vertex[(vertex >= a) & (vertex < b)] - a for a, b in itertools.pairwise(first)]
-
-
-def _counts(scene: Scene) -> list[int]:
-    return [len(part.mesh.position) for part in scene.parts]
 
 
 def compare(
@@ -269,7 +265,7 @@ def compare(
 def _errors(view: View, name: str, candidate: SystemScene, picture: Array, truth: Truth) -> dict[str, Any]:
     """Relative L2 errors of a picture and of vertices, and the number of vertices with negative radiance."""
     number, color = list(view.lights).index(name), candidate.color(view.lights[name], jnp.asarray(view.camera.eye))
-    parts = jnp.split(color, np.cumsum(_counts(view.scene))[:-1])
+    parts = jnp.split(color, np.cumsum(view.scene.counts)[:-1])
     rows = zip(view.scene.parts, parts, truth.vertex, truth.radiance, strict=True)
     error, spread = truth.pixels.relative_l2(picture, light=number)
     return {

@@ -126,9 +126,8 @@ def precompute(
     warn.of_shells(near)
     warn.of_backs(scene, whole, default_camera(scene, whole))
     options = {"size": size, "executor": executor, "progress": progress}
-    counts = [len(part.mesh.position) for part in scene.parts]
     parts = groups.kinds(shadings, recipes)
-    place = groups.Place.of(counts, parts, [recipes[members[0]].joins for members in parts])
+    place = groups.Place.of(scene.counts, parts, [recipes[members[0]].joins for members in parts])
     names = [_file_name(members, scene) for members in place.parts]
     targets = [Target(mesh, path=folder and folder / name, **options) for name in names]
     systems = _systems(recipes, shadings, targets, place)
@@ -230,7 +229,7 @@ def _recipes(system: str | Recipe | Mapping[str, str | Recipe], scene: Scene) ->
 def _recipe(system, name: str, scene: Scene) -> Recipe:
     """The recipe of the part of a name."""
     if isinstance(system, Mapping):
-        names = [part.name for part in scene.parts]
+        names = scene.names
         missing, unknown = (set(a) - set(b) for a, b in ((names, system), (system, names)))
         if missing or unknown:
             raise ValueError(f"systems must be given for each of the parts {names}, got {list(system)}")

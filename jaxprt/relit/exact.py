@@ -281,7 +281,7 @@ class _Shown(NamedTuple):
         pixels = visible_points(mesh, camera, samples=4, hidden=_hidden_faces(scene, mesh), occluder=occluder)
         region, face, triangle = (np.asarray(each) for each in (mesh.region, mesh.face, pixels.triangle))
         owner = np.where(triangle >= 0, region[face[triangle, 0]], -1)
-        return cls(pixels, owner, face, np.cumsum([0, *(len(part.mesh.position) for part in scene.parts)])[:-1])
+        return cls(pixels, owner, face, np.cumsum([0, *scene.counts])[:-1])
 
     def points(self, index: Int[np.ndarray, " m"], part: int) -> Points:
         """The points of some indices, all of one part."""

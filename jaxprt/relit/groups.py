@@ -7,7 +7,7 @@ another in their group, and where each part stands is known on the host.
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -28,6 +28,7 @@ from jaxprt.systems.bounces import GroupBounces, ReflectingPart
 from jaxprt.systems.lamps import LitByLamps
 from jaxprt.systems.protocol import Blend, System
 
+T = TypeVar("T")
 _FEWEST = 64  # vertices of a group
 
 
@@ -132,6 +133,11 @@ class Place(eqx.Module):
         size = [max(shared_size(count), _FEWEST) if padded else count for count, padded in pairs]
         return cls(tuple(counts), tuple(tuple(members) for members in parts), tuple(size))
 
+    @classmethod
+    def apart(cls, counts: Sequence[int]) -> "Place":
+        """The places of parts each of which is a group of its own, without padding."""
+        return cls(tuple(counts), tuple((number,) for number in range(len(counts))), tuple(counts))
+
     @cached_property
     def group(self) -> Int[np.ndarray, " n"]:
         """Group of each part."""
@@ -158,9 +164,14 @@ class Place(eqx.Module):
         """Index of a vertex of each part in the scene, minus its index in its group."""
         return self.first - self.start
 
+    def of_group(self, number: int, values: Sequence[T] | np.ndarray) -> list[T]:
+        """The values of the parts of a group, from those of all parts."""
+        return [values[part] for part in self.parts[number]]
+
     def vertices(self, number: int) -> Int[np.ndarray, " v"]:
         """Index in the scene of each vertex of a group, without padding."""
-        return np.concatenate([self.first[part] + np.arange(self.counts[part]) for part in self.parts[number]])
+        pairs = zip(self.of_group(number, self.first), self.of_group(number, self.counts), strict=True)
+        return np.concatenate([first + np.arange(count) for first, count in pairs])
 
     def order(self) -> Int[np.ndarray, " v"]:
         """Index of each vertex of the scene among the vertices of all groups."""
@@ -176,10 +187,10 @@ class Place(eqx.Module):
 
     def gathered(self, number: int, appearances: Sequence[Appearance]) -> Appearance:
         """The appearance of a group from those of all parts."""
-        members = [appearances[part] for part in self.parts[number]]
+        members = self.of_group(number, appearances)
         emitted = None
         if any(look.emitted is not None for look in members):
-            none = [np.zeros((self.counts[part], 3), jnp.result_type(float)) for part in self.parts[number]]
+            none = [np.zeros((count, 3), jnp.result_type(float)) for count in self.of_group(number, self.counts)]
             pairs = zip(members, none, strict=True)
             emitted = self.column(number, [zero if look.emitted is None else look.emitted for look, zero in pairs])
         if members[0].blend is None:
@@ -396,7 +407,7 @@ def surface(
         reflecting: How the group reflects light from other surfaces; None without bounces.
         lit: How it reflects light from lamps; None without lamps.
     """
-    members = [shadings[part] for part in place.parts[number]]
+    members = place.of_group(number, shadings)
     shading, dtype = members[0], jnp.result_type(float)
     scale = None
     if shading.scale is not None and shading.blend is not None:

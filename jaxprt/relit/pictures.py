@@ -305,14 +305,14 @@ def _traced_rows(stage: Stage, pixels: Pixels) -> Iterator[Row]:
     first = jnp.asarray(stage.face)[jnp.maximum(pixels.triangle, 0), 0]
     owner = jnp.where(pixels.triangle >= 0, jnp.asarray(stage.part)[first], -1)
     for number, parts in enumerate(stage.place.parts):
-        samples = max(stage.samples[part] for part in parts)
+        samples = max(stage.place.of_group(number, stage.samples))
         yield Row(number, samples, canvas.rows_of(jnp.isin(owner, jnp.asarray(parts))), None)
 
 
 def _rows(stage: Stage, owner: np.ndarray) -> Iterator[Row]:
     """The points in rows by group and number of samples."""
     for number, parts in enumerate(stage.place.parts):
-        for samples in sorted({stage.samples[part] for part in parts}):
+        for samples in sorted(set(stage.place.of_group(number, stage.samples))):
             same = [part for part in parts if stage.samples[part] == samples]
             for index in canvas.rows_of(np.isin(owner, same), owner=owner):
                 yield Row(number, samples, index, None)

@@ -191,8 +191,7 @@ def plan(
         plans.append(GroupPlan(names, count, sample.mesh_error, chosen, considered))
     reflected = reflection.fractions(shadings, environments, opacity=mesh.opacity, point_lights=scene.point_lights)
     bounces = reflection.needed(reflected, asked)
-    names = tuple(part.name for part in scene.parts)
-    return Plan(names, tuple(plans), reflected, bounces, float(asked), float(rate), size, key)
+    return Plan(tuple(scene.names), tuple(plans), reflected, bounces, float(asked), float(rate), size, key)
 
 
 def _unmet(names: Sequence[str], best: Candidate, error: float | None) -> None:

@@ -116,7 +116,7 @@ def divided(
             return scene, None
         wanted = ERROR
     require.number("refine", wanted, 0.0)
-    count = sum(len(part.mesh.position) for part in scene.parts)
+    count = sum(scene.counts)
     most = 2 * count + _ROOM if vertices is None else vertices
     require.count("vertices", most, least=1)
     if any(isinstance(part.material, PerVertex) for part in scene.parts) or not any(
@@ -163,7 +163,7 @@ def _geometry(scene: Scene) -> list[np.ndarray]:
 def _division(scene: Scene, key: str, options: dict) -> MeshDivision:
     steps, error = _divisions(scene, **options)
     face, origin, parent = zip(*steps, strict=True) if steps else ((), (), ())
-    counts = tuple(len(part.mesh.position) for part in scene.parts)
+    counts = tuple(scene.counts)
     return MeshDivision(key, face, origin, parent, counts, error)
 
 

@@ -89,7 +89,7 @@ def make(
     )
     groups = []
     for number, (shading, path) in enumerate(zip(first, of_group, strict=True)):
-        parts = [shadings[part] for part in place.parts[number]]
+        parts = place.of_group(number, shadings)
         frame = [frames(part.mesh.normal, part.mesh.tangent) for part in parts]
         position = place.column(number, [part.mesh.position for part in parts])
         table = harmonic_table(shading, degree=DEGREE)

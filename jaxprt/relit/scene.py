@@ -267,7 +267,7 @@ class RelitScene(System):
         traced = iter(()) if view.reflected is None else iter(view.reflected.radiance(view.stage, light))
         colors = []
         for number, (surface, viewed) in enumerate(zip(self.surfaces, view.group, strict=True)):
-            surface = groups.sampled(surface, max(view.stage.samples[part] for part in self.place.parts[number]))
+            surface = groups.sampled(surface, max(self.place.of_group(number, view.stage.samples)))
             reflections = next(traced) if number in view.stage.sharp_groups else None
             colors.append(radiance(surface, light.at(number), viewed, reflections=reflections))
         return groups.ordered(tuple(colors), self._order())
@@ -286,14 +286,15 @@ class RelitScene(System):
 
     def _untilted(self, number: int) -> tuple[Points, Points | None]:
         """`_points` without normal maps."""
-        parts = self.place.parts[number]
         if self.points is None:
             vertex = self.place.column(number, [self.place.vertices(number)])
             return material_table.at_vertices(vertex.astype(np.int32)), None
-        placed = [self.points[part] for part in parts]
-        xp = np if known(placed) else jnp
-        corner = [points.corner + self.place.start[part] for points, part in zip(placed, parts, strict=True)]
-        in_scene = [points.corner + self.place.first[part] for points, part in zip(placed, parts, strict=True)]
+        placed = self.place.of_group(number, self.points)
+        xp, firsts = np if known(placed) else jnp, (self.place.first, self.place.start)
+        in_scene, corner = (
+            [points.corner + row for points, row in zip(placed, self.place.of_group(number, first), strict=True)]
+            for first in firsts
+        )
         weight = xp.concatenate([points.weight for points in placed], 1)
         slopes: list[Any] = [points.slope for points in placed]
         slope = None if any(rows is None for rows in slopes) else xp.concatenate(slopes, 2)
@@ -303,7 +304,7 @@ class RelitScene(System):
 
     def _real(self, number: int) -> Float[np.ndarray, " v"]:
         """1 at vertices of a group, 0 in padding."""
-        count = sum(self.place.counts[part] for part in self.place.parts[number])
+        count = sum(self.place.of_group(number, self.place.counts))
         return (np.arange(self.place.size[number]) < count).astype(self.mesh.position.dtype)
 
     def _order(self) -> Any:
@@ -311,23 +312,22 @@ class RelitScene(System):
         if self.points is None:
             return self.place.order()
         counts = [len(points) for points in self.points]
-        size = [sum(counts[part] for part in members) for members in self.place.parts]
+        size = [sum(self.place.of_group(number, counts)) for number in range(len(self.surfaces))]
         return Place(tuple(counts), self.place.parts, tuple(size)).order()
 
     def _gathered(self, appearances: Mapping[str, Appearance]) -> list[Appearance]:
         """The appearance of each group: the precomputed one, or with other materials of some parts."""
         if not appearances:
             return list(self.appearance)
-        names = [part.name for part in self.scene.parts]
-        looks, result = self._all(appearances), []
-        for number, members in enumerate(self.place.parts):
-            changed = any(names[part] in appearances for part in members)
-            result.append(self.place.gathered(number, looks) if changed else self.appearance[number])
-        return result
+        looks, changed = self._all(appearances), [name in appearances for name in self.scene.names]
+        return [
+            self.place.gathered(number, looks) if any(self.place.of_group(number, changed)) else look
+            for number, look in enumerate(self.appearance)
+        ]
 
     def _stage(self, materials: Mapping[str, Any] | None, appearances: Mapping[str, Appearance]) -> Stage:
         """The scene with given materials, as pictures and reflections take it."""
-        of_parts, names = dict(materials or {}), [part.name for part in self.scene.parts]
+        of_parts, names = dict(materials or {}), self.scene.names
         new = {name: material for name, material in of_parts.items() if _is_model(material)}
         table, rough = self._tables(new)
         fixed = [name in of_parts and name not in new for name in names]
@@ -384,7 +384,7 @@ class RelitScene(System):
     def _surface(self, number: int, sharp: Sequence[bool]) -> Surface:
         """A group, with rays for its reflections if any of its parts is sharp."""
         surface = self.surfaces[number]
-        if surface.reflecting is None or not self.rays or not any(sharp[part] for part in self.place.parts[number]):
+        if surface.reflecting is None or not self.rays or not any(self.place.of_group(number, sharp)):
             return surface.without_rays
         return dataclasses.replace(surface, reflecting=dataclasses.replace(surface.reflecting, count=self.rays))
 
@@ -392,13 +392,13 @@ class RelitScene(System):
         self, number: int, fixed: Sequence[bool], appearances: Sequence[Appearance]
     ) -> VertexMaterials | None:
         """Materials that users give at the vertices of some parts of a group; None without."""
-        members = self.place.parts[number]
-        if not any(fixed[part] for part in members) or self.surfaces[number].scale is None:
+        flags, counts = (self.place.of_group(number, values) for values in (fixed, self.place.counts))
+        if not any(flags) or self.surfaces[number].scale is None:
             return None
-        names = {part: appearances[part] if fixed[part] else _precomputed(self.shading[part]) for part in members}
-        whole = self.place.gathered(number, [names.get(part, Appearance(None)) for part in range(len(fixed))])
+        rows = zip(appearances, fixed, self.shading, strict=True)
+        whole = self.place.gathered(number, [look if flag else _precomputed(shading) for look, flag, shading in rows])
         dtype = self.mesh.position.dtype
-        flag = self.place.column(number, [np.full(self.place.counts[part], fixed[part], dtype) for part in members])
+        flag = self.place.column(number, [np.full(*row, dtype) for row in zip(counts, flags, strict=True)])
         emitted = np.zeros((self.place.size[number], 3), dtype) if whole.emitted is None else whole.emitted
         assert whole.blend is not None
         return put(VertexMaterials(whole.blend, emitted, flag))
@@ -620,7 +620,7 @@ class RelitScene(System):
             raise TypeError(
                 f"the materials must be a dictionary from names of parts to materials, got {type(materials).__name__}"
             )
-        names = [part.name for part in self.scene.parts]
+        names = self.scene.names
         unknown = [name for name in materials if name not in names]
         if unknown:
             raise ValueError(f"materials must be for the parts {names}, got one for {unknown[0]!r}")
@@ -661,7 +661,7 @@ class RelitScene(System):
             TypeError: `points` is not one list of points for each part.
             ValueError: A point is not on a triangle of its part.
         """
-        checked = protocol.check_points(points, [len(part.mesh.position) for part in self.scene.parts])
+        checked = protocol.check_points(points, self.scene.counts)
         return eqx.tree_at(lambda relit: relit.points, self, checked, is_leaf=lambda leaf: leaf is None)
 
     @property

@@ -243,6 +243,16 @@ class Scene(eqx.Module):
         if twice:
             raise ValueError(f"the parts of a scene must have different names, got several named {twice}")
 
+    @property
+    def names(self) -> list[str]:
+        """Names of the parts."""
+        return [part.name for part in self.parts]
+
+    @property
+    def counts(self) -> list[int]:
+        """Number of vertices of each part."""
+        return [len(part.mesh.position) for part in self.parts]
+
     def __getitem__(self, name: str) -> Part:
         """The part with a given name.
 
@@ -252,7 +262,7 @@ class Scene(eqx.Module):
         for part in self.parts:
             if part.name == name:
                 return part
-        raise KeyError(f"there is no part {name!r}, only {[part.name for part in self.parts]}")
+        raise KeyError(f"there is no part {name!r}, only {self.names}")
 
     @property
     def mesh(self) -> Mesh:

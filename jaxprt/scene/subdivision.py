@@ -216,7 +216,7 @@ def subdivide_scene(scene: Scene, divisions: Sequence[Division]) -> Scene:
             )
     if not divisions:
         return scene
-    counts = [len(part.mesh.position) for part in scene.parts]
+    counts = scene.counts
     parents, owner, number = _of_parts(counts, [division.parent for division in divisions])
     face = divisions[-1].face
     faces = [number[face[owner[face[:, 0]] == part]] for part in range(len(counts))]

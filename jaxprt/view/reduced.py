@@ -52,7 +52,7 @@ class PageScene:
         Raises:
             ValueError: A page cannot show the system of a part.
         """
-        names = [part.name for part in relit.scene.parts]
+        names = relit.scene.names
         systems = [axes.mapped(relit.part_system(n), lambda _, leaf: put(leaf)) for n in range(len(names))]
         parts = [system.exported(f"part {name!r}") for name, system in zip(names, systems, strict=True)]
         pairs = zip(systems, parts, strict=True)
@@ -91,9 +91,7 @@ class PageScene:
         if self.texels is not None:
             rows = zip(systems, self.texels, self.parts, self.shading, strict=True)
             systems = [system if seen is None else _with_texels(system, seen, *row) for system, seen, *row in rows]
-        counts = [len(part.mesh.position) for part in self.scene.parts]
-        place = Place.of(counts, [[number] for number in range(len(counts))], [False] * len(counts))
-        return RelitScene(self.scene, self.shading, place, systems)
+        return RelitScene(self.scene, self.shading, Place.apart(self.scene.counts), systems)
 
     @property
     def bits(self) -> list[UInt8[np.ndarray, "v n"]] | None:

@@ -54,7 +54,7 @@ class Viewer(anywidget.AnyWidget):
 
     def __repr__(self) -> str:
         """The names of the systems and lights; the same in every run."""
-        return f"Viewer of {', '.join(part.name for part in self.session.stages.scene.scene.parts)}"
+        return f"Viewer of {', '.join(self.session.stages.scene.scene.names)}"
 
     def _ipython_display_(self, **options: Any) -> None:
         """Displays a picture and the widget that replaces it. A saved notebook shows the picture without a kernel."""

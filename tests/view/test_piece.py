@@ -284,7 +284,7 @@ def test_size_that_is_asked_for_is_kept(systems, lights, made, tmp_path):
 def test_what_a_page_does_not_have_is_refused(systems, tmp_path):
     scene = systems["harmonics"]
     ball, ground = (put(scene.part_system(number)) for number in range(2))
-    place = Place.of(scene.place.counts, [[0], [1]], [False, False])
+    place = Place.apart(scene.place.counts)
 
     def refused(system, told):
         changed = RelitScene(scene.scene, scene.shading, place, (system, ground))
