@@ -30,7 +30,7 @@ from jaxprt.scene import Environment, builtin, load_environment, load_mesh
 from jaxprt.scene.mesh import Mesh, bounds, ground_plane, join
 from jaxprt.systems.lobe import LobeTransport
 from jaxprt.systems.separable import ClusteredTransport, SeparableSystem
-from jaxprt.visibility import StoredVisibility
+from jaxprt.visibility import Run, StoredVisibility
 
 LIGHTS = {"Grace": "grace_cross.hdr", "Eucalyptus": "eucalyptus_rnl_cross.hdr", "sun": "polyhaven_sunrise_1k.exr"}
 BRDF = AshikhminShirley()
@@ -83,7 +83,7 @@ def measure(quick: bool, store: pathlib.Path | None):
 
     start = time.perf_counter()
     visible = [
-        visibility.precompute(whole, size=size, vertex=vertex, path=store and store / f"{name}.prt", progress=False)
+        visibility.precompute(whole, size=size, vertex=vertex, run=Run(store and store / f"{name}.prt", progress=False))
         for name, vertex in (("glossy", np.arange(count)), ("ground", np.arange(count, len(whole.position))))
     ]
     rays = time.perf_counter() - start
@@ -175,7 +175,13 @@ def compressed(visible, brdf, factored, clusters: int, limit: tuple[int, int, in
     components = min(components, -(-len(visible.position) // clusters))
     modes = min(modes, components * factored.terms, keep)
     transport = separable.clustered.precompute(
-        visible, factored, clusters=clusters, components=components, modes=modes, keep=keep, path=path, progress=False
+        visible,
+        factored,
+        clusters=clusters,
+        components=components,
+        modes=modes,
+        keep=keep,
+        run=Run(path, progress=False),
     )
     return Part(visible, brdf, factored, transport)
 
@@ -296,7 +302,7 @@ def measure_published(glossy, whole, exact, lights, views, quick: bool):
     factored.append(separable.factor(GROUND, terms=1, resolution=8))
     vertex = [np.arange(count), np.arange(count, len(whole.position))]
     parts = [
-        SeparableSystem(separable.precompute(whole, brdf, size=size, vertex=part, progress=False), brdf)
+        SeparableSystem(separable.precompute(whole, brdf, size=size, vertex=part, run=Run(progress=False)), brdf)
         for brdf, part in zip(factored, vertex, strict=True)
     ]
     seconds = time.perf_counter() - start

@@ -130,7 +130,7 @@ def measure(
     place = Place.apart(sizes)
     for count in counts:
         start = time.perf_counter()
-        target = Target(scene.mesh, size=16, progress=False)
+        target = Target(scene.mesh, size=16, run=prt.Run(progress=False))
         system = reflection.make(scene.shadings, place, count, target)
         seconds = time.perf_counter() - start
         blends = [each.blend for each in scene.shadings]

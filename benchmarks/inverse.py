@@ -88,7 +88,7 @@ def lights(mesh: Mesh, sky: Environment, view: Camera, exact: bool, store: pathl
     """From one picture."""
     start = time.perf_counter()
     table = harmonic.tabulate(Lambert(ALBEDO), degree=DEGREE, resolution=16)
-    vectors = harmonic.precompute(mesh, degree=DEGREE, path=store and store / "harmonic", progress=False)
+    vectors = harmonic.precompute(mesh, degree=DEGREE, run=prt.Run(store and store / "harmonic", progress=False))
     ready = time.perf_counter() - start
 
     def radiance(light, eye):
@@ -173,9 +173,9 @@ class Coated:
     def __init__(self, mesh: Mesh, lobes: LobeBrdf, size: int, degree: int, store: pathlib.Path | None):
         start = time.perf_counter()
         self.lobes = lobes
-        self.seen = lobe.precompute(mesh, size=size, path=store and store / "lobe", progress=False)
+        self.seen = lobe.precompute(mesh, size=size, run=prt.Run(store and store / "lobe", progress=False))
         name = store and store / f"harmonic{degree}"
-        self.shadows = harmonic.precompute(mesh, degree=degree, path=name, progress=False)
+        self.shadows = harmonic.precompute(mesh, degree=degree, run=prt.Run(name, progress=False))
         self.base = harmonic.tabulate(base, degree=degree, resolution=16)
         self.seconds = time.perf_counter() - start
 

@@ -50,7 +50,9 @@ def measure(quick: bool):
     glossy, ground, lights = compression.scene(quick)
     vertex = np.random.default_rng(0).permutation(len(glossy.position))[: 60 if quick else 300]
     size = lights[0].radiance.shape[-2]
-    visible = visibility.precompute(join([glossy, ground]), size=size, vertex=np.sort(vertex), progress=False)
+    visible = visibility.precompute(
+        join([glossy, ground]), size=size, vertex=np.sort(vertex), run=prt.Run(progress=False)
+    )
     transport = lobe.compress(visible)
     seen = jnp.asarray(visible.seen(np.arange(len(vertex))))
     views = jnp.asarray(compression.eyes(glossy, 2 if quick else 20))

@@ -34,6 +34,7 @@ from jaxprt.brdf import AshikhminShirley
 from jaxprt.scene import Mesh, builtin, load_mesh, occluder, subdivision
 from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.systems import ranges
+from jaxprt.visibility import Run
 
 SCANS = "dragon_100k", "happy_buddha_100k"
 COUNTS = 10_000, 100_000, 1_000_000
@@ -84,15 +85,15 @@ def relit(count: int, quick: bool) -> list[dict[str, Any]]:
     """Precomputes a mesh, and meets new light by ranges of its vertices."""
     mesh = scene(count, quick)
     brdf = separable.factor(AshikhminShirley(), terms=TERMS, resolution=24)
-    separable.precompute(builtin.plane(cells=1), brdf, keep=KEEP, size=SIZE, progress=False)  # compiles
+    separable.precompute(builtin.plane(cells=1), brdf, keep=KEEP, size=SIZE, run=Run(progress=False))  # compiles
     vertices, before = len(mesh.position), harness.peak_memory()
     with tempfile.TemporaryDirectory() as folder:
         store, saved = pathlib.Path(folder) / "store", pathlib.Path(folder) / "saved"
         began = time.perf_counter()
-        made = separable.precompute(mesh, brdf, keep=KEEP, size=SIZE, path=store, progress=False)
+        made = separable.precompute(mesh, brdf, keep=KEEP, size=SIZE, run=Run(store, progress=False))
         seconds, peak = time.perf_counter() - began, harness.peak_memory()
         sample = np.linspace(0, vertices - 1, SAMPLE).astype(int)
-        some = separable.precompute(mesh, brdf, keep=KEEP, size=SIZE, vertex=sample, progress=False)
+        some = separable.precompute(mesh, brdf, keep=KEEP, size=SIZE, vertex=sample, run=Run(progress=False))
         case = {"benchmark": "million", "vertices": vertices}
         line = {
             **case,
@@ -137,12 +138,12 @@ def new_light(transport: separable.SparseTransport, count: int) -> dict[str, Any
 def fine_part(count: int, quick: bool) -> list[dict[str, Any]]:
     """A part of the visibility at all texels."""
     mesh, size = scene(count, quick), SIZE if quick else FINE
-    visibility.precompute(builtin.plane(cells=1), size=size, progress=False)
+    visibility.precompute(builtin.plane(cells=1), size=size, run=Run(progress=False))
     before, parts = harness.peak_memory(), 2 if quick else PARTS
     with tempfile.TemporaryDirectory() as folder, visibility.Shard(1, parts) as part:
         path, began = pathlib.Path(folder) / "store", time.perf_counter()
         with contextlib.suppress(visibility.UnfinishedError):
-            visibility.precompute(mesh, size=size, path=path, executor=part, progress=False)
+            visibility.precompute(mesh, size=size, run=Run(path, part, progress=False))
         seconds, done = time.perf_counter() - began, part.of(-(-len(mesh.position) // visibility.rays.BLOCK))
     return [
         {

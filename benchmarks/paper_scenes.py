@@ -156,7 +156,7 @@ def with_transfer(scene: prt.RelitScene, path: pathlib.Path | None = None, **opt
     lights = [paths.factored(scene.shading[parts[0]]) for parts in scene.place.parts]
     weights = [paths.typical(part, lights[n]) for part, n in zip(scene.shading, scene.place.group, strict=True)]
     brdfs, mesh = [lights[number].brdf for number in scene.place.group], joined_mesh(scene.shading)
-    tensor = bounces.precompute(mesh, brdfs, weights=weights, path=path, progress=False, **options)
+    tensor = bounces.precompute(mesh, brdfs, weights=weights, run=prt.Run(path, progress=False), **options)
     vertices = [scene.place.vertices(number) for number in range(len(lights))]
     made = bounces.GroupBounces.make(tensor, scene.bounces.group, vertices)
     return eqx.tree_at(lambda relit: relit.bounces, scene, made)

@@ -24,6 +24,7 @@ from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.scene import Mesh, builtin, load_mesh
 from jaxprt.scene.mesh import ground_plane, join, split
 from jaxprt.sphere import cubemap
+from jaxprt.visibility import Run
 
 SIZE = 64
 EVERY = 8
@@ -56,12 +57,12 @@ def main(options: Sequence[str] | None = None) -> None:
     normal = np.asarray(whole.normal)
     # One block of each part compiles.
     for (mesh, _, _), brdf in zip(parts, factored, strict=True):
-        separable.precompute(mesh, brdf, size=size, occluder=whole, vertex=np.arange(1), progress=False)
+        separable.precompute(mesh, brdf, size=size, occluder=whole, vertex=np.arange(1), run=Run(progress=False))
     chosen = np.arange(0, len(start), visibility.rays.BLOCK)[:: 2 if arguments.quick else EVERY]
     counts = [embree_alone(recorder, start, normal, chosen[0::2], size)]
     began = time.perf_counter()
     result = [
-        separable.precompute(mesh, brdf, keep=96, size=size, occluder=whole, progress=not arguments.quick)
+        separable.precompute(mesh, brdf, keep=96, size=size, occluder=whole, run=Run(progress=not arguments.quick))
         for (mesh, _, _), brdf in zip(parts, factored, strict=True)
     ]
     seconds = time.perf_counter() - began

@@ -164,7 +164,7 @@ def errors(relit: RelitScene, triples: Sequence[Triple], materials: Sequence[dic
     """Errors of the triples of each roughness, at some vertices that face the eye."""
     chosen = np.random.default_rng(1).permutation(relit.vertices)[: 40 if quick else 600]
     vertex, size = np.sort(chosen), triples[0].light.radiance.shape[-2]
-    visible = visibility.precompute(relit.mesh, size=size, vertex=vertex, progress=False)
+    visible = visibility.precompute(relit.mesh, size=size, vertex=vertex, run=prt.Run(progress=False))
     seen, part = jnp.asarray(visible.seen(np.arange(len(vertex)))), np.asarray(relit.mesh.region)[vertex]
     result: dict[float, list] = {roughness: [] for roughness in ROUGHNESS[: len(triples)]}
     for triple, now in zip(triples, materials, strict=True):

@@ -208,7 +208,7 @@ def errors(quick: bool) -> list[dict]:
     eye = mesh.position.mean(0) + jnp.array([0.5, 0.7, 2.0]) * jnp.linalg.norm(jnp.ptp(mesh.position, 0))
     facing = np.flatnonzero(np.sum(np.asarray(mesh.normal * (eye - mesh.position)), 1) > 0)
     vertex = np.random.default_rng(0).permutation(facing)[: 50 if quick else 400]
-    full = harmonic.precompute(mesh, degree=degree, vertex=vertex, progress=False)
+    full = harmonic.precompute(mesh, degree=degree, vertex=vertex, run=prt.Run(progress=False))
     lines = []
     for name, model in list(BRDFS.items())[1:2] if quick else BRDFS.items():
         table = harmonic.tabulate(model, degree=degree, resolution=32 if quick else 128)
@@ -246,16 +246,16 @@ def precomputation(quick: bool) -> dict:
     name, mesh = next(iter(meshes(quick).items())) if quick else ("buddha", table_mesh("buddha"))
     recorder, size = Recorder(mesh), 32
     start, normal = visibility.start_points(mesh, recorder), np.asarray(mesh.normal)
-    harmonic.precompute(mesh, degree=DEGREE, size=size, vertex=np.arange(1), progress=False)
+    harmonic.precompute(mesh, degree=DEGREE, size=size, vertex=np.arange(1), run=prt.Run(progress=False))
     chosen = np.arange(0, len(start), visibility.rays.BLOCK)[:: 2 if quick else 8]
     before = embree_alone(recorder, start, normal, chosen[0::2], size)
     began = time.perf_counter()
-    made = harmonic.precompute(mesh, degree=DEGREE, size=size, progress=not quick)
+    made = harmonic.precompute(mesh, degree=DEGREE, size=size, run=prt.Run(progress=not quick))
     seconds = time.perf_counter() - began
     after = embree_alone(recorder, start, normal, chosen[1::2], size)
     embree = (before[1] + after[1]) / (before[2] + after[2]) * len(start)
     few = np.random.default_rng(0).choice(len(start), 64, replace=False)
-    fine = harmonic.precompute(mesh, degree=DEGREE, size=2 * size, vertex=few, progress=False).matrix
+    fine = harmonic.precompute(mesh, degree=DEGREE, size=2 * size, vertex=few, run=prt.Run(progress=False)).matrix
     return {
         "benchmark": "relight_harmonic",
         "case": f"precomputed transfer, {name}, {len(start)} vertices, 25 x 25",

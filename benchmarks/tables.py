@@ -29,6 +29,7 @@ from jaxprt.image import interpolate, rasterize
 from jaxprt.scene import Camera, Mesh, builtin, camera, load_mesh, occluder
 from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.systems.separable import SeparableBrdf, SeparableSystem
+from jaxprt.visibility import Run
 
 KEEP = 96
 SIZE = 64
@@ -88,7 +89,9 @@ def measure(
     shadows = occluder.simplify(whole, faces=faces)
     one_term = separable.factor(Lambert(0.5), terms=1)
     # One vertex compiles and does not count.
-    separable.precompute(ground, one_term, keep=KEEP, size=size, occluder=shadows, vertex=np.arange(1), progress=False)
+    separable.precompute(
+        ground, one_term, keep=KEEP, size=size, occluder=shadows, vertex=np.arange(1), run=Run(progress=False)
+    )
     began = time.perf_counter()
     below = precompute(ground, one_term, shadows, size)
     ground_seconds = time.perf_counter() - began
@@ -96,7 +99,9 @@ def measure(
     for column, terms in enumerate((1, 4)):
         glossy = separable.factor(AshikhminShirley(diffuse=0.5, specular=0.75, nu=10, nv=100), terms=terms)
         began = time.perf_counter()
-        separable.precompute(mesh, glossy, keep=KEEP, size=size, occluder=shadows, vertex=np.arange(1), progress=False)
+        separable.precompute(
+            mesh, glossy, keep=KEEP, size=size, occluder=shadows, vertex=np.arange(1), run=Run(progress=False)
+        )
         compiled = time.perf_counter() - began
         began = time.perf_counter()
         upon = precompute(mesh, glossy, shadows, size)
@@ -124,7 +129,7 @@ def measure(
 
 def precompute(mesh: Mesh, brdf: SeparableBrdf, shadows: Mesh, size: int):
     """Transport in floating point and in whole numbers."""
-    result = separable.precompute(mesh, brdf, keep=KEEP, size=size, occluder=shadows, progress=False)
+    result = separable.precompute(mesh, brdf, keep=KEEP, size=size, occluder=shadows, run=Run(progress=False))
     return result, jax.block_until_ready(quantize(result))
 
 

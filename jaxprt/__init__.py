@@ -31,6 +31,7 @@ from jaxprt.scene import Camera, Environment, Part, Scene, load_environment, loa
 from jaxprt.systems import bounces, bright_texels, dynamic, harmonic, lamps, lobe, reference, separable
 from jaxprt.systems.devices import shard
 from jaxprt.systems.protocol import Blend, System, memory, radiance, total
+from jaxprt.visibility import Run
 
 __all__ = [
     "Blend",
@@ -38,6 +39,7 @@ __all__ = [
     "Environment",
     "Part",
     "RelitScene",
+    "Run",
     "Scene",
     "System",
     "bounces",

@@ -147,7 +147,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
         _light(folder, name, np.array(sun))
     _measured(folder / "measured.brdf")
     mesh = prt.load_mesh(folder / "mesh.ply")
-    system = prt.harmonic.DiffuseSystem(prt.harmonic.precompute_diffuse(mesh, size=8, progress=False), jnp.full(3, 0.5))
+    system = prt.harmonic.DiffuseSystem(prt.harmonic.precompute_diffuse(mesh, size=8), jnp.full(3, 0.5))
     camera = prt.scene.camera.orbit(mesh, azimuth=0.5, elevation=0.3, width=64, height=64)
     light = prt.load_environment(folder / "light.exr", size=8)
     image = prt.image.render(mesh, prt.radiance(system, light, eye=camera.eye), camera)

@@ -407,9 +407,10 @@ def image_verbs() -> dict[str, Verb]:
 def system_verbs() -> dict[str, Verb]:
     """Precomputation and relighting functions of the systems."""
     here, model = mesh(), prt.brdf.Lambert(0.5)
-    common = {"mesh": here, "size": SIZE, "occluder": None, "vertex": None, "path": None, "executor": None}
-    quiet = {"keep": ("progress",), "progress": False}
+    common = {"mesh": here, "size": SIZE, "occluder": None, "vertex": None}
+    quiet = {"run": prt.Run(progress=False)}
     return {
+        "Run": Verb(prt.Run, keep=("progress",), path="missing", executor=None, progress=True),
         "harmonic.precompute": Verb(prt.harmonic.precompute, degree=2, **common, **quiet),
         "harmonic.precompute_diffuse": Verb(prt.harmonic.precompute_diffuse, degree=2, **common, **quiet),
         "harmonic.tabulate": Verb(

@@ -18,12 +18,12 @@ def scene():
     ball = trimesh.creation.icosphere(subdivisions=2)
     mesh = prt.scene.mesh.make_mesh(ball.vertices, ball.faces, normal=ball.vertices)
     camera = prt.scene.camera.orbit(mesh, elevation=0.3, width=48, height=48)
-    return mesh, camera, prt.visibility.precompute(mesh, size=8, progress=False)
+    return mesh, camera, prt.visibility.precompute(mesh, size=8)
 
 
 def separable(mesh, visible, eye):
     brdf = prt.separable.factor(prt.brdf.Lambert(ALBEDO), terms=1, resolution=8)
-    transport = prt.separable.precompute(mesh, brdf, keep=384, size=8, progress=False)
+    transport = prt.separable.precompute(mesh, brdf, keep=384, size=8)
     return prt.radiance(prt.separable.SeparableSystem(transport, brdf), WHITE, eye=eye)
 
 

@@ -15,7 +15,7 @@ from benchmarks import harness, relight_harmonic
 from benchmarks.figures import drawing
 from benchmarks.figures.run import LIGHTS, Clock, Run
 from benchmarks.published.harmonics import unshadowed_radiance
-from jaxprt import harmonic, image, reference
+from jaxprt import harmonic, image, reference, visibility
 from jaxprt.brdf import AshikhminShirley, Phong, PoulinFournier, load_scattered
 from jaxprt.scene import Camera, Environment, Mesh, camera
 from jaxprt.scene.mesh import brush, rotate
@@ -148,7 +148,9 @@ def shadowed(
 def transfer(run: Run, mesh: Mesh, name: str):
     """Transfer matrices of a mesh, from the store where they are."""
     size = 8 if run.quick else 32
-    return harmonic.precompute(mesh, degree=DEGREE, size=size, path=run.keep(f"{name}_matrices.prt"), progress=False)
+    return harmonic.precompute(
+        mesh, degree=DEGREE, size=size, run=visibility.Run(run.keep(f"{name}_matrices.prt"), progress=False)
+    )
 
 
 def figure_7(run: Run) -> Iterator[dict[str, Any]]:

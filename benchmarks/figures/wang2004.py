@@ -68,8 +68,7 @@ class Stage:
             self.whole,
             size=8 if run.quick else 64,
             vertex=self.shown,
-            path=run.keep(f"{name}_{part}_{wide:g}.prt"),
-            progress=False,
+            run=prt.Run(run.keep(f"{name}_{part}_{wide:g}.prt"), progress=False),
         )
 
     def relit(

@@ -334,7 +334,7 @@ def table(name: str, view: View, vertex: np.ndarray, truth: np.ndarray) -> list[
     """Errors of one system at several sizes, on some vertices of the first part."""
     shading = of_part(view.scene.parts[0], takes=lambda table: False)
     size = next(iter(view.lights.values())).radiance.shape[-2]
-    target = Target(view.scene.mesh, size=size, vertex=vertex, progress=False)
+    target = Target(view.scene.mesh, size=size, vertex=vertex, run=visibility.Run(progress=False))
     blend = None if shading.blend is None else jax.tree.map(lambda leaf: leaf[vertex], shading.blend)
     rows = []
     for sizes, system in TABLES[name](shading, target):
@@ -375,8 +375,7 @@ def _separable(shading: Shading, target: Target):
 def _harmonic(shading: Shading, target: Target):
     """Systems of several degrees, with and without a window."""
     degree = max(TABLE_DEGREES)
-    options = {"degree": degree, **target.traced(), "progress": False}
-    full = harmonic.precompute(shading.mesh, **options)
+    full = harmonic.precompute(shading.mesh, degree=degree, **target.traced("matrices"))
     brdf = harmonic_table(shading, degree=degree)
     for degree, laplacian in itertools.product(TABLE_DEGREES, TABLE_LAPLACIAN):
         terms = (degree + 1) ** 2
@@ -387,9 +386,8 @@ def _harmonic(shading: Shading, target: Target):
 
 def _lobe(shading: Shading, target: Target):
     """Systems with several numbers of lobes and single texels."""
-    options = {"size": target.size, **target.traced(), "progress": False}
-    seen = visibility.precompute(shading.mesh, **options)
-    target = Target(target.occluder, size=target.size, vertex=target.vertex, known=Known(seen), progress=False)
+    seen = visibility.precompute(shading.mesh, size=target.size, **target.traced("visibility"))
+    target = dataclasses.replace(target, known=Known(seen))
     for lobes, texels in itertools.product(TABLE_LOBES, TABLE_TEXELS):
         yield {"lobes": lobes, "texels": texels}, relit.Lobes(lobes, texels).make(shading, target)
 

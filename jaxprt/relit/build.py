@@ -22,7 +22,7 @@ from jaxprt.relit.scene import RAYS, RelitScene
 from jaxprt.scene import Environment, Part, Scene, sides
 from jaxprt.scene.scene import centered, default_camera
 from jaxprt.systems.protocol import System
-from jaxprt.visibility import UnfinishedError
+from jaxprt.visibility import Run, UnfinishedError
 from jaxprt.visibility.blocks import fingerprint
 
 _MOST = 1 << 13  # texels along the edge of a face
@@ -102,7 +102,8 @@ def precompute(
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
     scene, copied = sides.with_copies(scene)
-    _check_options(size, error, rate, environments, rays, path, executor)
+    run = Run(path, executor, progress)
+    _check_options(size, error, rate, environments, rays)
     reflection.check(bounces)
     recipes = None if system is None else _recipes(system, scene)
     folder = None if path is None else pathlib.Path(path)
@@ -125,17 +126,16 @@ def precompute(
     warn.of_gain(near, shadings)
     warn.of_shells(near)
     warn.of_backs(scene, whole, default_camera(scene, whole))
-    options = {"size": size, "executor": executor, "progress": progress}
     parts = groups.kinds(shadings, recipes)
     place = groups.Place.of(scene.counts, parts, [recipes[members[0]].joins for members in parts])
     names = [_file_name(members, scene) for members in place.parts]
-    targets = [Target(mesh, path=folder and folder / name, **options) for name in names]
+    targets = [Target(mesh, size=size, run=run.within(name)) for name in names]
     systems = _systems(recipes, shadings, targets, place)
     lit = lamps.make(near, shadings, place, systems, targets, scene.point_lights)
     reflected = None
     if bounces:
         # One store serves any number of bounces: a larger number resumes from a smaller one.
-        target = Target(mesh, path=folder and folder / "scene", **options)
+        target = Target(mesh, size=size, run=run.within("scene"))
         lamp = lit and lit.transport(place)
         reflected = reflection.make(shadings, place, bounces, target, lamp=lamp, systems=systems if rays else None)
     fields = {"lamps": lit, "rays": rays, "division": divided, "copied": copied}
@@ -172,11 +172,8 @@ def _systems(
     return systems
 
 
-def _check_options(size, error, rate, environments, rays, path, executor) -> None:
+def _check_options(size, error, rate, environments, rays) -> None:
     """Refuses options of wrong kinds, and numbers that no system takes."""
-    require.executor(executor)
-    if path is not None:
-        require.path("path", path)
     whole = isinstance(size, int | np.integer) and not isinstance(size, bool)
     if size is not None and not (whole and 1 <= size <= _MOST and size & (size - 1) == 0):
         raise ValueError(f"size must be a power of two, got {require.shown(size)}; the largest is {_MOST}")

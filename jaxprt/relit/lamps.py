@@ -124,7 +124,7 @@ def make(
     groups = []
     for members, size, system, target in zip(place.parts, place.size, systems, targets, strict=True):
         shading, mesh = shadings[members[0]], joined_mesh([shadings[part] for part in members])
-        options = target.traced() | target.options("lamps")
+        options = target.traced("lamps")
         transport = axes.joined([lamps.precompute(mesh, sources, apart=True, **options)], size=size)
         if shading.matte:
             groups.append(LitByLamps(transport, albedo=shading.albedo))

@@ -107,7 +107,9 @@ def measure(scene: Any, environments: Sequence[Environment]) -> Report:
         count = len(part.mesh.position)
         few = max(FEWEST, round(JUDGED * count / len(mesh.position)))
         vertex = np.sort(np.random.default_rng(1).permutation(count)[:few])
-        visible = visibility.precompute(shading.mesh, size=size, occluder=mesh, vertex=vertex, progress=False)
+        visible = visibility.precompute(
+            shading.mesh, size=size, occluder=mesh, vertex=vertex, run=visibility.Run(progress=False)
+        )
         judged = np.arange(len(vertex))
         brdf = exact_brdf(shading, vertex)
         exact = _exact(visible, judged, brdf, environments, views)

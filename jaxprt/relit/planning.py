@@ -26,7 +26,7 @@ from jaxprt.relit.recipes import Lobes, Recipe, Terms
 from jaxprt.relit.sampling import Candidate, Sample
 from jaxprt.scene import Environment, Scene, sides
 from jaxprt.scene.scene import centered
-from jaxprt.visibility import blocks
+from jaxprt.visibility import Run, blocks
 
 ERROR = 0.05  # that is asked for where none is given
 MARGIN = 1.25  # safety factor on the error, for lights and views that were not measured
@@ -160,8 +160,7 @@ def plan(
             then gives the smallest error that can be met.
     """
     require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
-    if path is not None:
-        require.path("path", path)
+    run = Run(path, progress=progress)
     named, environments = environments, lights_of(scene) if environments is None else environments
     asked = ERROR if error is None else error
     size, key = checked(environments, asked, rate), key_of(centered(scene), environments)
@@ -176,7 +175,7 @@ def plan(
         members, names = [scene.parts[part] for part in own], tuple(scene.parts[part].name for part in own)
         sample = Sample.make(members, [shadings[part] for part in own], mesh, total, size, environments, views)
         count = len(sample.shading.mesh.position)
-        kept = None if path is None else pathlib.Path(path) / f"{key}_{number}"
+        kept = run.within(f"{key}_{number}").path
         alone = None
         if len(own) == 1:
             alone = sample.alone(members[0], channels.of_part(members[0], look=looks[own[0]], takes=Terms().takes))

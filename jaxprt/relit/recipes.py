@@ -3,10 +3,7 @@
 import abc
 import dataclasses
 import functools
-import os
-import pathlib
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
 from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
@@ -21,7 +18,7 @@ from jaxprt.systems.lobe import LobeTransport, diffuse, pyramid
 from jaxprt.systems.protocol import System
 from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.systems.standard import StandardTable
-from jaxprt.visibility import StoredVisibility
+from jaxprt.visibility import Run, StoredVisibility
 
 T = TypeVar("T")
 
@@ -67,27 +64,18 @@ class Target:
         vertex: Indices of the vertices to precompute; all if None.
         known: Intermediate results that exist already. `Lobes` and `Clusters` then trace no rays; other recipes ignore
             it.
-        path: Prefix of the names of the folders that store results; None stores nothing.
-        executor: Executor that computes the blocks of work; all cores of this machine if None.
-        progress: Whether to show progress bars.
+        run: Folder of the results of the part, executor and progress bars.
     """
 
     occluder: Mesh
     size: int = 64
     vertex: np.ndarray | None = None
     known: "Known | None" = None
-    path: str | os.PathLike | None = None
-    executor: Executor | None = None
-    progress: bool = True
+    run: Run = Run()
 
-    def options(self, name: str) -> dict:
-        """Keyword arguments that every `precompute` takes, with a folder of the given name."""
-        path = None if self.path is None else pathlib.Path(f"{self.path}_{name}.prt")
-        return {"path": path, "executor": self.executor, "progress": self.progress}
-
-    def traced(self) -> dict:
-        """Additional keyword arguments of the `precompute` functions that trace rays."""
-        return {"occluder": self.occluder, "vertex": self.vertex}
+    def traced(self, name: str) -> dict:
+        """Keyword arguments of the `precompute` functions that trace rays, with a folder of the given name."""
+        return {"occluder": self.occluder, "vertex": self.vertex, "run": self.run.within(f"{name}.prt")}
 
 
 class Recipe(eqx.Module):
@@ -198,7 +186,7 @@ class Harmonics(Recipe):
         matte = shading.matte
         trace = harmonic.precompute_diffuse if matte else harmonic.precompute
         store = f"{'vectors' if matte else 'matrices'}_{self.degree}"
-        size, options = min(target.size, _HARMONIC_SIZE), target.traced() | target.options(store)
+        size, options = min(target.size, _HARMONIC_SIZE), target.traced(store)
         whole: Any = trace(shading.mesh, degree=self.degree, size=size, apart=True, **options)
         transport = padded(whole, vertices)
         if shading.matte:
@@ -249,7 +237,7 @@ class Terms(_OneBrdf):
         terms = 1 if shading.matte else self.terms
         factored = separable.factor(shading.brdf, terms=terms, resolution=self.resolution)
         keep = min(self.keep, 6 * target.size**2)
-        options = {"keep": keep, "size": target.size, **target.traced(), **target.options("separable")}
+        options = {"keep": keep, "size": target.size, **target.traced("separable")}
         return separable.SeparableSystem(separable.precompute(shading.mesh, factored, **options), factored)
 
     def steps(self, shading: Shading) -> Sequence[Recipe]:
@@ -283,12 +271,11 @@ class Clusters(_OneBrdf):
         check(self, shading)
         known = target.known
         if known is None:
-            options = {**target.traced(), **target.options("visibility")}
-            known = Known(visibility.precompute(shading.mesh, size=target.size, **options))
+            known = Known(visibility.precompute(shading.mesh, size=target.size, **target.traced("visibility")))
         visible = known.visible
         clusters, terms, sizes = self._sizes(shading, len(visible.position), visible.size)
         factored = known.factored(shading.brdf, terms, self.resolution)
-        options = {**sizes, **target.options("clusters")}
+        options = {**sizes, "run": target.run.within("clusters.prt")}
         transport = separable.clustered.precompute(visible, factored, clusters=clusters, **options)
         system = separable.SeparableSystem(transport, factored)
         return _bright(system, pyramid.bits(known.pyramid), shading, self.texels, visible.size)
@@ -356,12 +343,11 @@ class Dynamic(Recipe):
             return Lobes(texels=self.texels).make(shading, target, vertices=vertices)
         known = target.known
         if known is None:
-            options = {**target.traced(), **target.options("visibility")}
-            known = Known(visibility.precompute(shading.mesh, size=target.size, **options))
+            known = Known(visibility.precompute(shading.mesh, size=target.size, **target.traced("visibility")))
         brdf = dynamic_table(shading, self.lobes, self.ranks)
         sizes = {"components": self.components, "modes": self.modes, "keep": self.keep}
         name = "" if self.ranks is None else "_" + "_".join(map(str, (self.lobes, *self.ranks)))
-        options = {**sizes, **target.options(f"dynamic{name}")}
+        options = {**sizes, "run": target.run.within(f"dynamic{name}.prt")}
         transport = padded(dynamic.compress(known.visible, brdf, pyramid=known.pyramid, **options), vertices)
         return _bright(dynamic.DynamicSystem(transport, brdf), transport.pyramid, shading, self.texels, target.size)
 
@@ -406,7 +392,7 @@ def _pyramid(mesh: Mesh, target: Target) -> LobeTransport:
     """The visibility pyramids of a mesh."""
     if target.known is not None:
         return target.known.pyramid
-    return lobe.precompute(mesh, size=target.size, apart=True, **target.traced(), **target.options("lobe"))
+    return lobe.precompute(mesh, size=target.size, apart=True, **target.traced("lobe"))
 
 
 def _bright(system: System, visible, shading: Shading, texels: int, size: int) -> System:

@@ -20,6 +20,7 @@ from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.protocol import System
+from jaxprt.visibility import Run
 
 ALL = bounces.build.ALL
 _EACH = 3  # number of bounces that are estimated one by one; further ones are extrapolated as a geometric series
@@ -82,7 +83,7 @@ def make(
     )
     sent = [of_group[place.group[parts[0]]] for parts in members]
     weights = [_mean([typical[part] for part in parts], [place.counts[part] for part in parts]) for parts in members]
-    options = {"edge": min(_EDGE, target.size), **target.options("bounces")}
+    options = {"edge": min(_EDGE, target.size), "run": target.run.within("bounces.prt")}
     # Omit nothing: the number of bounces is decided, and later materials may reflect more.
     tensor = bounces.precompute(
         mesh, [path.brdf for path in sent], weights=weights, lamps=lamp, bounces=count, **options
@@ -203,7 +204,7 @@ def _irradiance(
     if not radiance:
         return np.zeros((len(mesh.position), 3), np.float32)
     sources = [*(shading.mesh for shading in glowing), *point_lights]
-    transport = lamps.precompute(mesh, sources, samples=_SAMPLES, pieces=1, apart=True, progress=False)
+    transport = lamps.precompute(mesh, sources, samples=_SAMPLES, pieces=1, apart=True, run=Run(progress=False))
     return np.asarray(transport.cosine).T @ np.stack(radiance).astype(np.float32) / np.float32(np.pi)
 
 

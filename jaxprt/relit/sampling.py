@@ -22,7 +22,7 @@ from jaxprt.scene.mesh import frames
 from jaxprt.scene.points import Points, placed
 from jaxprt.systems import protocol, reference
 from jaxprt.systems.protocol import Blend, System
-from jaxprt.visibility import members
+from jaxprt.visibility import Run, members
 
 MEMBERS = 225  # number of vertices in a cluster
 _CLUSTERS = 24  # number of measured clusters, of all parts together: errors differ much between clusters
@@ -113,12 +113,12 @@ class Sample:
         member = members.cluster(mesh.position, mesh.normal, clusters=clusters)
         some = min(clusters, max(2, round(_CLUSTERS * count / total)))
         vertex = np.unique(member[np.random.default_rng(0).permutation(clusters)[:some]])
-        start = time.perf_counter()
-        visible = visibility.precompute(mesh, size=size, occluder=scene, vertex=vertex, progress=False)
+        quiet, start = Run(progress=False), time.perf_counter()
+        visible = visibility.precompute(mesh, size=size, occluder=scene, vertex=vertex, run=quiet)
         seconds = time.perf_counter() - start
         few = max(FEWEST, round(JUDGED * count / total))
         points = _scattered(mesh, vertex, few)
-        target = Target(scene, size=size, vertex=vertex, known=Known(visible), progress=False)
+        target = Target(scene, size=size, vertex=vertex, known=Known(visible), run=quiet)
         whole = Points(jnp.asarray(vertex)[points.corner], points.weight)
         blend, brdf = channels.materials_at(parts, shading, whole)
         level = points.carry(jnp.asarray(visible.seen(np.arange(len(vertex))), jnp.float32))

@@ -8,7 +8,7 @@ from jaxprt.visibility import rays as rays
 from jaxprt.visibility import refinement as refinement
 from jaxprt.visibility import starts as starts
 from jaxprt.visibility import stored as stored
-from jaxprt.visibility.blocks import Shard, UnfinishedError
+from jaxprt.visibility.blocks import Run, Shard, UnfinishedError
 from jaxprt.visibility.occluder import Occluder
 from jaxprt.visibility.rays import LEVELS as LEVELS
 from jaxprt.visibility.rays import exhaustive as exhaustive
@@ -20,6 +20,7 @@ from jaxprt.visibility.stored import StoredVisibility, precompute
 
 __all__ = [
     "Occluder",
+    "Run",
     "Shard",
     "StoredVisibility",
     "UnfinishedError",

@@ -10,6 +10,7 @@ import queue
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -17,6 +18,7 @@ import numpy as np
 import tqdm
 from threadpoolctl import threadpool_limits
 
+from jaxprt import require
 from jaxprt.files import arrays
 from jaxprt.files.arrays import BlockStore, Layout
 from jaxprt.scene.mesh import Mesh
@@ -100,24 +102,67 @@ def cores() -> int:
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
-def compute(
-    job: Job,
-    *,
-    path: str | os.PathLike | None = None,
-    executor: Executor | None = None,
-    progress: bool = True,
-    label: str = "precompute",
-) -> dict[str, np.ndarray]:
+def _check_context(executor: Executor | None) -> None:
+    """Refuses process pools that fork.
+
+    A forked process has the locks of JAX's threads but not the threads, and waits forever for a lock that one of them
+    held.
+    """
+    context = getattr(executor, "_mp_context", None) if isinstance(executor, ProcessPoolExecutor) else None
+    if context is not None and context.get_start_method() == "fork":
+        raise ValueError(
+            'executor must not fork this process, got a ProcessPoolExecutor with the context "fork": JAX runs threads, '
+            "and forked workers would hang; make it by ProcessPoolExecutor(n, "
+            'mp_context=multiprocessing.get_context("spawn"))'
+        )
+
+
+@dataclass(frozen=True)
+class Run:
+    """Where a precomputation stores its work, what computes it, and whether it shows progress.
+
+    Attributes:
+        path: Folder in which finished blocks of work are stored; it is made with its parents. A call that was
+            interrupted continues from there. None stores nothing.
+        executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
+            A `Shard` computes only its own blocks. A `ProcessPoolExecutor` must have the context "spawn" or
+            "forkserver".
+        progress: Whether to show progress bars.
+
+    Raises:
+        TypeError: `path` is not a path, or `executor` has no method `submit`.
+        ValueError: `executor` forks this process, or is a `Shard` without a path.
+    """
+
+    path: str | os.PathLike | None = None
+    executor: Executor | None = None
+    progress: bool = True
+
+    def __post_init__(self):
+        """Checks the path and the executor."""
+        if self.path is not None:
+            require.path("path", self.path)
+        require.executor(self.executor)
+        _check_context(self.executor)
+        part = self.executor
+        if isinstance(part, Shard) and self.path is None:
+            raise ValueError(
+                f"part {part.number}/{part.count} must have a path, the folder that all parts share, got None"
+            )
+
+    def within(self, name: str) -> "Run":
+        """The same, with a folder of this name inside of the folder."""
+        return self if self.path is None else replace(self, path=os.path.join(self.path, name))
+
+
+def compute(job: Job, run: Run = Run(), *, label: str = "precompute") -> dict[str, np.ndarray]:
     """Computes all blocks of a job.
 
     With a path, the worker that computes a block also writes it, if it can access the folder.
 
     Args:
         job: The computation.
-        path: Folder of the store. Finished blocks are kept there; blocks found there are not computed again.
-        executor: Executor that computes the blocks; threads on this machine's cores if None. A `Shard` computes only
-            its own blocks. A `ProcessPoolExecutor` must have the context "spawn" or "forkserver".
-        progress: Whether to show a progress bar.
+        run: Folder of the store, executor and progress bar. Blocks found in the folder are not computed again.
         label: Text of the progress bar.
 
     Returns:
@@ -125,23 +170,20 @@ def compute(
         whose first axis is that of the blocks are memory-mapped: pages are read when they are first used.
 
     Raises:
-        ValueError: The store at `path` was made from other inputs, `executor` is a `Shard` and there is no path, or it
-            forks this process.
+        ValueError: The store was made from other inputs.
         BlockingIOError: Another process is writing to the store.
         OSError: The disk is full; finished blocks are kept in the store.
         UnfinishedError: This part is finished, but others are not.
         RuntimeError: A worker died; finished blocks are kept in the store.
     """
-    _check_context(executor)
+    executor = run.executor
     blocks = -(-job.vertices // job.step)
     part = executor if isinstance(executor, Shard) else None
-    if part is not None and path is None:
-        raise ValueError(f"part {part.number}/{part.count} must have a path, the folder that all parts share, got None")
-    store = None if path is None else BlockStore(path, job.header, job.layout, blocks, job.near)
+    store = None if run.path is None else BlockStore(run.path, job.header, job.layout, blocks, job.near)
     counts = {name: _entries(at, job, blocks) for name, at in job.layout.items()}
     chosen = range(blocks) if part is None else part.of(blocks)
     total = sum(_count(job, block) for block in chosen)
-    with tqdm.tqdm(total=total, desc=label, unit="vertex", unit_scale=True, disable=not progress) as bar:
+    with tqdm.tqdm(total=total, desc=label, unit="vertex", unit_scale=True, disable=not run.progress) as bar:
         if store is None:
             memory = _Memory(job, counts)
             _run(job, chosen, memory.place, None, executor, bar)
@@ -161,21 +203,6 @@ def compute(
                 "run the other parts, then run again without a part"
             )
     return {name: store.whole(name, count) for name, count in counts.items()}
-
-
-def _check_context(executor: Executor | None) -> None:
-    """Refuses process pools that fork.
-
-    A forked process has the locks of JAX's threads but not the threads, and waits forever for a lock that one of them
-    held.
-    """
-    context = getattr(executor, "_mp_context", None) if isinstance(executor, ProcessPoolExecutor) else None
-    if context is not None and context.get_start_method() == "fork":
-        raise ValueError(
-            'executor must not fork this process, got a ProcessPoolExecutor with the context "fork": JAX runs threads, '
-            "and forked workers would hang; make it by ProcessPoolExecutor(n, "
-            'mp_context=multiprocessing.get_context("spawn"))'
-        )
 
 
 class _Memory:

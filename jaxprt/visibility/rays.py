@@ -53,9 +53,8 @@ def _vertex(value: Any) -> None:
             raise TypeError(f"vertex must be a mask or indices, got {wrong}")
 
 
-def _path(value: Any) -> None:
-    if value is not None:
-        require.path("path", value)
+def _run(value: Any) -> None:
+    require.kind("run", value, blocks.Run, source="jaxprt.Run")
 
 
 def _size(value: Any) -> None:
@@ -68,8 +67,7 @@ PRECOMPUTE = {
     "mesh": _mesh,
     "occluder": _occluder,
     "vertex": _vertex,
-    "path": _path,
-    "executor": require.executor,
+    "run": _run,
     "size": _size,
 }
 

@@ -5,9 +5,7 @@ are summed one by one with the BRDF itself, the remaining light is smooth. The t
 computed from stored visibility without tracing rays again.
 """
 
-import os
 from collections.abc import Mapping
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +20,7 @@ from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import haar
 from jaxprt.visibility import blocks, rays
+from jaxprt.visibility.blocks import Run
 from jaxprt.visibility.rays import PRECOMPUTE
 
 # Versions of the algorithms; a release that changes results raises one of them.
@@ -87,9 +86,7 @@ def precompute(
     size: int = 64,
     occluder: Mesh | None = None,
     vertex: np.ndarray | None = None,
-    path: str | os.PathLike | None = None,
-    executor: Executor | None = None,
-    progress: bool = True,
+    run: Run = Run(),
 ) -> StoredVisibility:
     """Traces the visibility of every texel from each vertex and stores it.
 
@@ -100,9 +97,7 @@ def precompute(
         size: Edge of the light's cubemap faces in texels, a power of two.
         occluder: Geometry that casts shadows: the whole scene, or a simplified one; the mesh itself if None.
         vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
-        path: Folder for finished blocks. A call that was stopped or killed continues from them.
-        executor: Any `concurrent.futures.Executor` to compute blocks; this machine's cores if None.
-        progress: Whether to show a progress bar.
+        run: Folder of finished work, executor and progress bars. A call that was interrupted continues from the folder.
 
     Returns:
         The visibility of every chosen vertex. With a path it is memory-mapped on CPUs: only what is read takes memory.
@@ -116,7 +111,7 @@ def precompute(
     if size < 1 or size & (size - 1):
         raise ValueError(f"size must be a power of two, got {size}")
     job = _Job.make(mesh, occluder, vertex, size)
-    result = blocks.compute(job, path=path, executor=executor, progress=progress, label="visibility")
+    result = blocks.compute(job, run, label="visibility")
     position = rays.place(mesh, vertex)
     return StoredVisibility(jax.device_put(result["level"]), position, jax.device_put(job.frame))
 

@@ -137,7 +137,7 @@ def test_info_says_what_meshes_and_environments_hold(place, capsys):
 def test_info_says_what_is_left_out_and_what_folders_hold(place, capsys):
     prt.files.save(place / "kept" / "light", prt.load_environment(place / "sky.exr", size=8))
     ball = prt.scene.builtin.sphere(rings=6, sectors=8)
-    prt.visibility.precompute(ball, size=8, path=place / "kept" / "seen.prt", progress=False)
+    prt.visibility.precompute(ball, size=8, run=prt.Run(place / "kept" / "seen.prt"))
     (place / "mesh.obj").write_text("mtllib absent.mtl\nusemtl wood\n" + OBJ)
     assert main("info", place / "kept", place / "mesh.obj") == 0
     told = capsys.readouterr().out

@@ -186,7 +186,7 @@ def glossy():
 
 @pytest.fixture(scope="module")
 def traced(glossy):
-    return precompute(builtin.sphere(rings=5, sectors=8), glossy, keep=24, size=8, progress=False)
+    return precompute(builtin.sphere(rings=5, sectors=8), glossy, keep=24, size=8)
 
 
 def relight(transport, brdf):

@@ -19,7 +19,7 @@ def whole() -> TransferTensor:
     half = np.asarray(ball.face)[np.asarray(ball.position)[np.asarray(ball.face)].mean(1)[:, 1] < 0]
     bowl = make_mesh(ball.position, half[:, ::-1], normal=-ball.normal)
     white = separable.factor(Lambert(0.8), terms=1, resolution=8)
-    return bounces.precompute(bowl, [white], components=40, modes=40, edge=4, size=8, progress=False)
+    return bounces.precompute(bowl, [white], components=40, modes=40, edge=4, size=8)
 
 
 def test_fewer_components_and_modes_err_as_those_that_were_precomputed(whole):

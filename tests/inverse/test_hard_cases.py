@@ -228,7 +228,7 @@ def test_a_region_that_no_picture_shows_is_unknown_and_the_other_is_found(mesh, 
 def test_a_mirror_like_material_is_found_from_a_matte_start(mesh, view, monkeypatch):
     """Its lobes are finer than the light's texels are wide, and the start's as wide as a window."""
     monkeypatch.setattr(lobe.table, "_natural_error", lambda brdf, table: 0.0)  # Not asked for here, and slow.
-    light, seen = builtin.studio(size=8), lobe.precompute(mesh, size=8, progress=False)
+    light, seen = builtin.studio(size=8), lobe.precompute(mesh, size=8)
     table = lobe.tabulate(
         lambda m: CookTorrance(diffuse=0.0, specular=1.0, roughness=jnp.exp(m), f0=0.5),
         lobes=1,

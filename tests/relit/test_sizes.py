@@ -72,7 +72,7 @@ def test_the_rasterizer_and_interpolation_agree_with_float64(side):
 @pytest.mark.parametrize("side", SIDES)
 def test_light_from_a_picture_of_as_many_pixels_agrees_with_float64(side):
     mesh = hills(side).parts[0].mesh
-    transport = prt.harmonic.precompute_diffuse(mesh, degree=2, size=8, progress=False)
+    transport = prt.harmonic.precompute_diffuse(mesh, degree=2, size=8)
     camera = hills(side).cameras[0]
     true = prt.harmonic.project(LIGHT, degree=2)
 

@@ -246,7 +246,7 @@ def test_the_reference_takes_eyes_and_occluders_in_the_coordinates_of_the_file()
 def test_systems_of_far_meshes_say_that_eyes_are_relative():
     mesh = make_mesh(np.asarray(ball().vertices) + FAR, ball().faces)
     with pytest.warns(UserWarning, match=r"positions are relative to mesh\.origin, \(512352"):
-        prt.visibility.precompute(mesh, size=4, vertex=np.array([0]), progress=False)
+        prt.visibility.precompute(mesh, size=4, vertex=np.array([0]))
 
 
 def test_one_number_stands_for_three_coordinates_also_where_float32_rounds_it():

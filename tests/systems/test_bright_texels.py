@@ -35,7 +35,7 @@ def mesh():
 
 @pytest.fixture(scope="module")
 def transport(mesh):
-    return precompute(mesh, size=SIZE, progress=False)
+    return precompute(mesh, size=SIZE)
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +162,7 @@ def test_a_light_of_float32_keeps_its_type_where_float64_is_enabled(sky, x64):
 @pytest.mark.parametrize("part", ["vertices", "texels"])
 def test_none_have_no_radiance(mesh, transport, part):
     count = 0 if part == "texels" else COUNT
-    lit = precompute(mesh, size=SIZE, vertex=np.zeros(0, int), progress=False) if part == "vertices" else transport
+    lit = precompute(mesh, size=SIZE, vertex=np.zeros(0, int)) if part == "vertices" else transport
     color = shine(lit, GLOSSY, jnp.zeros(count, int), jnp.ones((count, 3)), eye=EYE)
     assert color.shape == (len(lit.position), 3)
     assert not np.asarray(color).any()
@@ -226,7 +226,7 @@ def test_radiance_is_linear_in_the_excess(transport, sky, random, close):
 
 
 def test_what_vertices_see_of_the_texels_may_be_looked_up_before_or_with_the_view(mesh, transport, sky, close):
-    nothing = harmonic.DiffuseSystem(harmonic.precompute_diffuse(mesh, size=SIZE, progress=False), jnp.zeros(3))
+    nothing = harmonic.DiffuseSystem(harmonic.precompute_diffuse(mesh, size=SIZE), jnp.zeros(3))
     system = bright_texels.BrightTexels(nothing, transport, GLOSSY, count=COUNT)
     lit, seen = system.light(sky), system.view(EYE)
     assert lit.seen is None

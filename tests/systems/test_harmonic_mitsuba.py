@@ -255,7 +255,7 @@ def estimates():
 
 @pytest.fixture(scope="module")
 def matrix(scene):
-    return precompute(scene.mesh(), degree=DEGREE, size=32, progress=False)
+    return precompute(scene.mesh(), degree=DEGREE, size=32)
 
 
 @pytest.fixture(scope="module")
@@ -267,14 +267,14 @@ def light():
 def ours(scene, light, matrix):
     """Radiance by way and number of bounces."""
     mesh, eye = scene.mesh(), jnp.asarray(EYE, jnp.float32)
-    vector = precompute_diffuse(mesh, degree=DEGREE, size=32, progress=False)
+    vector = precompute_diffuse(mesh, degree=DEGREE, size=32)
     result = {}
-    bounced = interreflect_diffuse(mesh, vector, np.array([ALBEDO]), bounces=BOUNCES, size=BOUNCED, progress=False)
+    bounced = interreflect_diffuse(mesh, vector, np.array([ALBEDO]), bounces=BOUNCES, size=BOUNCED)
     for bounces, transport in ((0, vector), (BOUNCES, bounced)):
         result["vector", bounces] = diffuse(transport, jnp.asarray(ALBEDO), light)[scene.vertex]
     for name, brdf in (("matrix", prt.brdf.Lambert(ALBEDO)), ("glossy", GLOSS)):
         table = tabulate(brdf, degree=DEGREE, resolution=16)
-        bounced = interreflect(mesh, matrix, [table], bounces=BOUNCES, size=BOUNCED, progress=False)
+        bounced = interreflect(mesh, matrix, [table], bounces=BOUNCES, size=BOUNCED)
         for bounces, transport in ((0, matrix), (BOUNCES, bounced)):
             result[name, bounces] = relight(transport, table, light, eye=eye)[scene.vertex]
     return result
@@ -328,8 +328,8 @@ def test_missing_bounces_would_be_noticed(ours, estimates, way, model):
 
 def test_one_bounce_for_two_would_be_noticed(scene, light, ours, estimates):
     mesh = scene.mesh()
-    vector = precompute_diffuse(mesh, degree=DEGREE, size=32, progress=False)
-    once = interreflect_diffuse(mesh, vector, np.array([ALBEDO]), bounces=1, size=BOUNCED, progress=False)
+    vector = precompute_diffuse(mesh, degree=DEGREE, size=32)
+    once = interreflect_diffuse(mesh, vector, np.array([ALBEDO]), bounces=1, size=BOUNCED)
     color = diffuse(once, jnp.asarray(ALBEDO), light)[scene.vertex]
     assert excess(color, *estimates["matte", BOUNCES]) > 0
 

@@ -61,7 +61,7 @@ class Promise(NamedTuple):
 @functools.cache
 def seen(name: str) -> visibility.StoredVisibility:
     """What the vertices of a scene see; rays are traced once for all systems."""
-    return visibility.precompute(mesh(name), size=SIZE, progress=False)
+    return visibility.precompute(mesh(name), size=SIZE)
 
 
 @functools.cache
@@ -130,7 +130,7 @@ def members_along() -> dynamic.BrdfSet:
 @functools.cache
 def sparse(name: str, model: str) -> tuple[prt.System, Any]:
     brdf = factored(model)
-    transport = separable.precompute(mesh(name), brdf, keep=6 * SIZE**2, size=SIZE, progress=False)
+    transport = separable.precompute(mesh(name), brdf, keep=6 * SIZE**2, size=SIZE)
     return separable.SeparableSystem(transport, brdf), None
 
 
@@ -139,17 +139,17 @@ def clustered(name: str, model: str) -> tuple[prt.System, Any]:
     members = max(1, len(visible.position) // 24)
     sizes = {"clusters": members, "components": min(24, len(visible.position) // members), "modes": 64, "keep": 384}
     sizes["modes"] = min(sizes["modes"], sizes["components"] * brdf.terms)
-    transport = separable.clustered.precompute(visible, brdf, **sizes, progress=False)
+    transport = separable.clustered.precompute(visible, brdf, **sizes)
     return separable.SeparableSystem(transport, brdf), None
 
 
 def matrices(name: str, model: str) -> tuple[prt.System, Any]:
-    transport = harmonic.precompute(mesh(name), degree=4, size=SIZE, progress=False)
+    transport = harmonic.precompute(mesh(name), degree=4, size=SIZE)
     return harmonic.HarmonicSystem(transport, harmonic_table(model)), None
 
 
 def vectors(name: str, model: str) -> tuple[prt.System, Any]:
-    transport = harmonic.precompute_diffuse(mesh(name), degree=4, size=SIZE, progress=False)
+    transport = harmonic.precompute_diffuse(mesh(name), degree=4, size=SIZE)
     return harmonic.DiffuseSystem(transport, jnp.ones(1) if model == "white" else jnp.full(1, 0.5)), None
 
 
@@ -176,7 +176,7 @@ def tensor(model: str) -> dynamic.DynamicBrdf:
 
 @functools.cache
 def dynamics(name: str, model: str) -> tuple[prt.System, Any]:
-    sizes = {"components": 16, "modes": 48, "keep": 384, "progress": False}
+    sizes = {"components": 16, "modes": 48, "keep": 384}
     transport = dynamic.compress(seen(name), tensor(model), **sizes)
     return dynamic.DynamicSystem(transport, tensor(model)), None
 
@@ -194,7 +194,7 @@ def changing(name: str, model: str) -> tuple[dynamic.SetSystem, Any]:
 def reflected(name: str, model: str) -> tuple[prt.System, Any]:
     direct, materials = changing(name, model)
     basis = [members_along()] * len(materials)
-    options = {"components": 8, "modes": 12, "edge": 2, "size": 4, "progress": False}
+    options = {"components": 8, "modes": 12, "edge": 2, "size": 4}
     return bounces.BouncesSystem(bounces.precompute(mesh(name), basis, **options), direct), materials
 
 
@@ -854,7 +854,7 @@ def test_gradients_come_back_in_the_type_of_the_light_and_the_eye(name):
 @pytest.mark.usefixtures("x64")
 def test_a_light_of_float32_is_taken_where_float64_is_enabled(close):
     table = harmonic.tabulate(GLOSSY, degree=2, error=0.5, resolution=16)
-    system = harmonic.HarmonicSystem(harmonic.precompute(mesh("triangle"), degree=2, size=4, progress=False), table)
+    system = harmonic.HarmonicSystem(harmonic.precompute(mesh("triangle"), degree=2, size=4), table)
     bright = np.random.default_rng(0).uniform(0.2, 1.0, (6, 4, 4, 3)).astype(np.float32)
     colors = [
         prt.radiance(system, Environment(jnp.asarray(bright, dtype)), eye=jnp.asarray(EYE, dtype))

@@ -20,7 +20,7 @@ EYE = jnp.array([0.3, 0.8, 3.0])
 def seen(tmp_path_factory):
     """Visibility of three blocks of vertices, mapped from its store."""
     path = tmp_path_factory.mktemp("ranges") / "a.prt"
-    return visibility.precompute(builtin.sphere(rings=12, sectors=14), size=SIZE, path=path, progress=False)
+    return visibility.precompute(builtin.sphere(rings=12, sectors=14), size=SIZE, run=prt.Run(path))
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def brdf():
 
 @pytest.fixture(scope="module")
 def sparse(brdf):
-    return separable.precompute(builtin.sphere(rings=12, sectors=14), brdf, keep=9, size=SIZE, progress=False)
+    return separable.precompute(builtin.sphere(rings=12, sectors=14), brdf, keep=9, size=SIZE)
 
 
 def pieces(value, function):
@@ -50,8 +50,8 @@ def test_ranges_of_a_saved_transport_relight_to_the_rows_of_the_whole(sparse, br
 
 def test_ranges_of_every_kind_of_transport_are_the_rows_of_its_arrays(sparse, seen):
     mesh = builtin.sphere(rings=12, sectors=14)
-    matrices = harmonic.precompute(mesh, degree=1, size=SIZE, progress=False)
-    vectors = harmonic.precompute_diffuse(mesh, degree=1, size=SIZE, progress=False)
+    matrices = harmonic.precompute(mesh, degree=1, size=SIZE)
+    vectors = harmonic.precompute_diffuse(mesh, degree=1, size=SIZE)
     pyramids = lobe.compress(seen)
     for value, field, axis in (
         (sparse, "value", 1),
@@ -78,7 +78,7 @@ def test_ranges_beyond_the_vertices_empty_or_within_a_block_are_refused(sparse, 
 
 
 def test_what_has_no_vertices_or_clusters_of_them_is_refused(seen, brdf):
-    clustered = separable.clustered.precompute(seen, brdf, progress=False, keep=20)
+    clustered = separable.clustered.precompute(seen, brdf, keep=20)
     for value, name in ((brdf, "SeparableBrdf"), (clustered, "ClusteredTransport")):
         with pytest.raises(TypeError, match=f"value must .*, got (a )?{name}"):
             ranges.take(value, 0, 3)

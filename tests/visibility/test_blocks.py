@@ -98,7 +98,7 @@ def sphere():
 
 def relit(sphere, **options):
     mesh, brdf = sphere
-    transport = precompute(mesh, brdf, **({"keep": 12, "size": 8, "progress": False} | options))
+    transport = precompute(mesh, brdf, **({"keep": 12, "size": 8} | options))
     return [np.asarray(each) for each in (transport.index, transport.value, transport.rms, transport.frame)]
 
 
@@ -115,7 +115,7 @@ def same(first, second):
 @pytest.mark.parametrize("vertices", [1, 3, 4, 5, 30, 32])
 def test_results_are_cut_to_the_vertices(vertices):
     job = Squares(vertices)
-    check(visibility.blocks.compute(job, progress=False), job)
+    check(visibility.blocks.compute(job), job)
 
 
 def test_a_progress_bar_ends_full_and_tells_the_rays(capsys):
@@ -128,10 +128,10 @@ def test_a_progress_bar_ends_full_and_tells_the_rays(capsys):
 
 def test_threads_and_processes_give_the_same_bits_as_none(sphere, expected, pool, tmp_path):
     with ThreadPoolExecutor(3) as threads:
-        same(relit(sphere, executor=threads), expected)
-    same(relit(sphere, executor=pool, path=tmp_path / "a.prt"), expected)
-    same(relit(sphere, path=tmp_path / "a.prt"), expected)
-    check(visibility.blocks.compute(Squares(), executor=pool, progress=False))
+        same(relit(sphere, run=prt.Run(executor=threads)), expected)
+    same(relit(sphere, run=prt.Run(tmp_path / "a.prt", pool)), expected)
+    same(relit(sphere, run=prt.Run(tmp_path / "a.prt")), expected)
+    check(visibility.blocks.compute(Squares(), prt.Run(executor=pool)))
 
 
 @pytest.fixture(scope="module")
@@ -163,21 +163,21 @@ class TestDask:
     pytestmark = quiet
 
     def test_workers_give_the_same_bits(self, sphere, expected, client):
-        same(relit(sphere, executor=client.get_executor()), expected)
+        same(relit(sphere, run=prt.Run(executor=client.get_executor())), expected)
 
     def test_a_killed_worker_is_survived_or_told_and_the_rest_is_done_by_a_second_call(self, client, tmp_path):
         trap = tmp_path / "trap"
         trap.touch()
         job, path = Squares(trap=str(trap)), tmp_path / "a.prt"
         try:
-            check(visibility.blocks.compute(job, path=path, executor=client.get_executor(), progress=False))
+            check(visibility.blocks.compute(job, prt.Run(path, client.get_executor())))
         except RuntimeError as error:
             told = str(error)
         else:
             told = str(path)
         assert str(path) in told
         assert not trap.exists()
-        check(visibility.blocks.compute(job, path=path, executor=client.get_executor(), progress=False))
+        check(visibility.blocks.compute(job, prt.Run(path, client.get_executor())))
         assert finished(path) == list(range(8))
 
 
@@ -191,9 +191,9 @@ def test_a_killed_worker_process_is_told_and_a_second_call_goes_on(tmp_path, sto
         ProcessPoolExecutor(1, mp_context=get_context("spawn")) as mortal,
         pytest.raises(RuntimeError, match=message),
     ):
-        visibility.blocks.compute(job, path=path, executor=mortal, progress=False)
+        visibility.blocks.compute(job, prt.Run(path, mortal))
     assert not trap.exists()
-    check(visibility.blocks.compute(job, path=path, progress=False))
+    check(visibility.blocks.compute(job, prt.Run(path)))
 
 
 def test_parts_in_any_order_make_the_whole_and_the_last_of_them_returns_it(tmp_path):
@@ -203,9 +203,9 @@ def test_parts_in_any_order_make_the_whole_and_the_last_of_them_returns_it(tmp_p
             Shard(number, 3) as part,
             pytest.raises(UnfinishedError, match=rf"part {number}/3 .*; {left} of its 8 blocks"),
         ):
-            visibility.blocks.compute(Counting(log=log), path=path, executor=part, progress=False)
+            visibility.blocks.compute(Counting(log=log), prt.Run(path, part))
     with Shard(1, 3) as part:
-        check(visibility.blocks.compute(Counting(log=log), path=path, executor=part, progress=False))
+        check(visibility.blocks.compute(Counting(log=log), prt.Run(path, part)))
     assert sorted(log) == list(range(8))
     assert [list(Shard(number, 3).of(8)) for number in (1, 2, 3)] == [[0, 1], [2, 3, 4], [5, 6, 7]]
 
@@ -215,10 +215,10 @@ def test_two_parts_of_one_number_write_at_once_and_the_same_part_twice_is_refuse
     store = BlockStore(path, job.header, job.layout, 8)
     with store.writing((2, 3)), Shard(1, 3) as one, Shard(2, 3) as two, Shard(1, 2) as half:
         with pytest.raises(UnfinishedError):
-            visibility.blocks.compute(job, path=path, executor=one, progress=False)
+            visibility.blocks.compute(job, prt.Run(path, one))
         for executor in (two, half, None):
             with pytest.raises(BlockingIOError, match=r"a\.prt is being written by another process"):
-                visibility.blocks.compute(job, path=path, executor=executor, progress=False)
+                visibility.blocks.compute(job, prt.Run(path, executor))
     assert sorted(job.log) == [0, 1]
 
 
@@ -230,7 +230,7 @@ def test_parts_that_are_not_there_are_refused(number, count):
 
 def test_a_part_without_a_folder_is_refused():
     with Shard(1, 2) as part, pytest.raises(ValueError, match="part 1/2 must have a path"):
-        visibility.blocks.compute(Squares(), executor=part, progress=False)
+        prt.Run(executor=part)
 
 
 class Slow(ThreadPoolExecutor):
@@ -262,7 +262,7 @@ def test_blocks_on_their_way_are_few_and_dropped_when_they_have_arrived(tmp_path
     job = Traced(vertices=400)
     with Slow(1) as executor:
         path = tmp_path / "a.prt" if stored else None
-        check(visibility.blocks.compute(job, path=path, executor=executor, progress=False), job)
+        check(visibility.blocks.compute(job, prt.Run(path, executor)), job)
         assert executor.most <= 2 * visibility.blocks.cores()
     assert 0 < most[0] <= 2 * visibility.blocks.cores() + 2
 
@@ -274,11 +274,11 @@ def test_workers_write_their_blocks_themselves_where_they_see_the_folder(tmp_pat
         raise AssertionError("the workers should have written this block")
 
     monkeypatch.setattr(BlockStore, "write", write)
-    check(visibility.blocks.compute(Squares(), path=path, executor=pool, progress=False))
+    check(visibility.blocks.compute(Squares(), prt.Run(path, pool)))
     monkeypatch.undo()
     # Workers that see another folder, or none, send their blocks.
     monkeypatch.setattr(BlockStore, "__getstate__", lambda self: {**vars(self), "_key": "another"}, raising=False)
-    check(visibility.blocks.compute(Squares(), path=tmp_path / "b.prt", executor=pool, progress=False))
+    check(visibility.blocks.compute(Squares(), prt.Run(tmp_path / "b.prt", pool)))
 
 
 def test_a_full_disk_is_told_and_a_second_call_goes_on(tmp_path):
@@ -287,13 +287,13 @@ def test_a_full_disk_is_told_and_a_second_call_goes_on(tmp_path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
     try:
         with pytest.raises(OSError, match=r"a\.prt cannot grow \(.*\); finished blocks are kept: call again"):
-            visibility.blocks.compute(job, path=path, progress=False)
+            visibility.blocks.compute(job, prt.Run(path))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     kept = finished(path)
     assert 100 < len(kept) < 1000
     again = Counting(name="full", vertices=4000)
-    check(visibility.blocks.compute(again, path=path, progress=False), job)
+    check(visibility.blocks.compute(again, prt.Run(path)), job)
     assert sorted({*again.log, *kept}) == list(range(1000))
     assert len(again.log) == 1000 - len(kept)
 
@@ -306,9 +306,9 @@ def test_an_error_in_a_worker_is_passed_on_and_finished_blocks_stay(tmp_path):
             return super().run(block)
 
     with ThreadPoolExecutor(1) as one, pytest.raises(ZeroDivisionError, match="block 7"):
-        visibility.blocks.compute(Broken(), path=tmp_path / "a.prt", executor=one, progress=False)
+        visibility.blocks.compute(Broken(), prt.Run(tmp_path / "a.prt", one))
     job = Counting()
-    check(visibility.blocks.compute(job, path=tmp_path / "a.prt", progress=False))
+    check(visibility.blocks.compute(job, prt.Run(tmp_path / "a.prt")))
     assert job.log == [*range(len(finished(tmp_path / "a.prt")))][8 - len(job.log) :]
 
 
@@ -339,7 +339,7 @@ for moment in map(float, sys.argv[3:]):
                 return original(*arguments, **options)
 
             setattr(owner, name, counted)
-        blocks.compute(Squares(), path=path, progress=False)
+        blocks.compute(Squares(), blocks.Run(path, progress=False))
         os._exit(0)
     print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
@@ -362,8 +362,8 @@ def test_a_process_killed_at_any_moment_leaves_a_store_that_goes_on_to_the_same_
     assert len(codes) == len(moments)
     assert set(codes) <= {-9, 0}
     assert codes[0] == -9
-    check(visibility.blocks.compute(Squares(), path=path, progress=False))
-    check(visibility.blocks.compute(Counting(log=(log := [])), path=path, progress=False))
+    check(visibility.blocks.compute(Squares(), prt.Run(path)))
+    check(visibility.blocks.compute(Counting(log=(log := [])), prt.Run(path)))
     assert not log
 
 
@@ -388,7 +388,7 @@ def mortal(*arguments):
 
 BlockStore.write = mortal
 mesh = prt.scene.builtin.sphere(rings=12, sectors=14)
-precompute(mesh, brdf, keep=12, size=8, progress=False, path=sys.argv[1])
+precompute(mesh, brdf, keep=12, size=8, run=prt.Run(sys.argv[1]))
 """
 
 
@@ -398,30 +398,30 @@ def test_precomputation_killed_and_resumed_equals_one_in_peace(sphere, expected,
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == -signal.SIGKILL, done.stderr
     assert len(finished(path)) == 1
-    same(relit(sphere, path=path), expected)
-    same(relit(sphere, path=path), expected)
+    same(relit(sphere, run=prt.Run(path)), expected)
+    same(relit(sphere, run=prt.Run(path)), expected)
 
 
 @pytest.mark.parametrize("name", ["checksum", "value"])
 def test_damaged_blocks_and_no_others_are_computed_again(tmp_path, name):
     path = tmp_path / "a.prt"
-    visibility.blocks.compute(Squares(), path=path, progress=False)
+    visibility.blocks.compute(Squares(), prt.Run(path))
     array = np.load(path / f"{name}.npy", mmap_mode="r+")
     array[5] = ~array[5] if name == "checksum" else -array[5]
     del array
     for again in ([5], []):
         job = Counting()
-        check(visibility.blocks.compute(job, path=path, progress=False))
+        check(visibility.blocks.compute(job, prt.Run(path)))
         assert job.log == again
 
 
 def test_finished_stores_are_read_without_computing_and_while_another_process_writes(tmp_path):
     path, first = tmp_path / "a.prt", Counting()
-    check(visibility.blocks.compute(first, path=path, progress=False))
+    check(visibility.blocks.compute(first, prt.Run(path)))
     assert sorted(first.log) == list(range(8))
     job = Counting()
     with BlockStore(path, job.header, job.layout, 8).writing():
-        check(visibility.blocks.compute(job, path=path, progress=False))
+        check(visibility.blocks.compute(job, prt.Run(path)))
     assert not job.log
 
 
@@ -431,14 +431,14 @@ def test_unfinished_stores_that_are_being_written_are_refused_at_once(tmp_path):
         BlockStore(tmp_path / "a.prt", job.header, job.layout, 8).writing(),
         pytest.raises(BlockingIOError, match=r"a\.prt is being written by another process"),
     ):
-        visibility.blocks.compute(job, path=tmp_path / "a.prt", progress=False)
+        visibility.blocks.compute(job, prt.Run(tmp_path / "a.prt"))
     assert not job.log
 
 
 def test_precomputation_refuses_the_store_of_anything_else(sphere, tmp_path):
     mesh, brdf = sphere
     path = tmp_path / "deep" / "down" / "a.prt"
-    relit(sphere, path=path)
+    relit(sphere, run=prt.Run(path))
     other = eqx.tree_at(lambda m: m.position, mesh, mesh.position.at[5, 1].add(1e-3))
     darker = eqx.tree_at(lambda b: b.light_map, brdf, brdf.light_map * 0.5)
     for wrong, options, name in (
@@ -453,14 +453,14 @@ def test_precomputation_refuses_the_store_of_anything_else(sphere, tmp_path):
         with pytest.raises(
             ValueError, match=rf"a\.prt holds arrays that were computed from other inputs \(.*{name}: stored"
         ):
-            relit(wrong, path=path, **options)
+            relit(wrong, run=prt.Run(path), **options)
     (tmp_path / "file").write_text("precious")
     with pytest.raises(ValueError, match="file exists but is not a readable store"):
-        relit(sphere, path=tmp_path / "file")
+        relit(sphere, run=prt.Run(tmp_path / "file"))
     assert not [file for file in path.rglob("*") if file.suffix in (".pkl", ".pickle")]
     (path / "store.json").write_text("{")  # As a machine leaves it that stops while it writes.
     with pytest.raises(ValueError, match=r"a\.prt exists but is not a readable store"):
-        relit(sphere, path=path)
+        relit(sphere, run=prt.Run(path))
 
 
 def rounded(tree):
@@ -478,23 +478,23 @@ def test_a_store_opens_with_the_floats_that_another_processor_computes_and_not_w
 ):
     mesh, brdf = sphere
     path = tmp_path / "a.prt"
-    relit(sphere, path=path)
+    relit(sphere, run=prt.Run(path))
     starts, frames = visibility.start_points, visibility.rays.frames
     monkeypatch.setattr(visibility.rays, "start_points", lambda *meshes, **options: rounded(starts(*meshes, **options)))
     monkeypatch.setattr(visibility.rays, "frames", lambda *each: rounded(frames(*each)))
     monkeypatch.setattr(separable.sparse, "compress", None)  # Nothing is computed again.
     other = eqx.tree_at(lambda b: b.light_map, brdf, jnp.asarray(rounded(brdf.light_map)))
-    same(relit((mesh, other), path=path)[:2], expected[:2])
+    same(relit((mesh, other), run=prt.Run(path))[:2], expected[:2])
     again = prt.separable.factor(prt.brdf.AshikhminShirley(nu=10.5), terms=2, resolution=8)
     with pytest.raises(
         ValueError, match=r"\(brdf: stored and given values differ by .* of the norm\).* jaxprt\.files\.save"
     ):
-        relit((mesh, again), path=path)
+        relit((mesh, again), run=prt.Run(path))
     monkeypatch.setattr(separable.sparse, "ALGORITHM", {"visibility": 2, "separable": 2})
     with pytest.raises(
         ValueError, match=r"a\.prt was made by version .*'separable': 1}.*'separable': 2}.*other results"
     ):
-        relit(sphere, path=path)
+        relit(sphere, run=prt.Run(path))
 
 
 def test_regions_that_touch_start_their_rays_apart_and_have_a_store_of_their_own(tmp_path):
@@ -505,7 +505,7 @@ def test_regions_that_touch_start_their_rays_apart_and_have_a_store_of_their_own
     alone = [visibility.start_points(surface, rays) for surface in (floor, wall)]
     np.testing.assert_array_equal(visibility.start_points(whole, rays, apart=True), np.concatenate(alone))
     assert np.any(visibility.start_points(whole, rays) != np.concatenate(alone))
-    options = {"degree": 1, "size": 4, "path": tmp_path / "store", "progress": False}
+    options = {"degree": 1, "size": 4, "run": prt.Run(tmp_path / "store")}
     harmonic.precompute_diffuse(whole, apart=True, **options)
     with pytest.raises(ValueError, match="computed from other inputs"):
         harmonic.precompute_diffuse(whole, **options)
@@ -551,8 +551,11 @@ def test_headers_of_all_traced_systems_name_versions_and_no_computed_float(spher
 
 def test_the_view_maps_and_the_error_of_the_brdf_do_not_matter_to_the_store(sphere, expected, tmp_path):
     mesh, brdf = sphere
-    relit(sphere, path=tmp_path / "a.prt")
-    same(relit((mesh, eqx.tree_at(lambda b: b.view_map, brdf, brdf.view_map * 2)), path=tmp_path / "a.prt"), expected)
+    relit(sphere, run=prt.Run(tmp_path / "a.prt"))
+    same(
+        relit((mesh, eqx.tree_at(lambda b: b.view_map, brdf, brdf.view_map * 2)), run=prt.Run(tmp_path / "a.prt")),
+        expected,
+    )
 
 
 def test_the_key_of_a_scene_tells_surfaces_and_regions_apart_and_no_tangents_or_types():
@@ -579,5 +582,5 @@ def test_fingerprints_tell_values_shapes_and_types_apart():
 def test_process_pools_that_fork_are_refused_by_the_remedy():
     with ProcessPoolExecutor(1, mp_context=get_context("fork")) as pool:
         with pytest.raises(ValueError, match=r'must not fork .* mp_context=multiprocessing.get_context\("spawn"\)'):
-            visibility.blocks.compute(Squares(), executor=pool, progress=False)
+            prt.Run(executor=pool)
         assert not pool._processes  # nothing was forked

@@ -92,7 +92,7 @@ def after(store, blocks, action):
 @pytest.mark.long
 def test_a_killed_worker_a_slow_one_and_a_scheduler_that_starts_again_leave_the_bits_of_a_run_alone(tmp_path):
     mesh = prt.scene.builtin.sphere(rings=60, sectors=100)
-    alone = visibility.precompute(mesh, size=16, progress=False)
+    alone = visibility.precompute(mesh, size=16)
     job = Dawdling.make(mesh, None, None, 16, turtle=str(tmp_path / "turtle"))
     path, blocks = tmp_path / "a.prt", -(-job.vertices // job.step)
     store = BlockStore(path, job.header, job.layout, blocks, job.near)
@@ -105,12 +105,12 @@ def test_a_killed_worker_a_slow_one_and_a_scheduler_that_starts_again_leave_the_
         with pytest.raises(
             RuntimeError, match=r"a worker died after .* they are kept in .*a\.prt: call again to go on"
         ):
-            visibility.blocks.compute(job, path=path, executor=cluster.client.get_executor(), progress=False)
+            visibility.blocks.compute(job, prt.Run(path, cluster.client.get_executor()))
         for each in accidents:
             each.join()
     assert blocks // 2 <= store.written().sum() < blocks
     with Cluster(tmp_path) as cluster:
-        result = visibility.blocks.compute(job, path=path, executor=cluster.client.get_executor(), progress=False)
+        result = visibility.blocks.compute(job, prt.Run(path, cluster.client.get_executor()))
     np.testing.assert_array_equal(result["level"], alone.level)
     assert (tmp_path / "turtle").exists()
 
@@ -122,7 +122,7 @@ from jaxprt import visibility
 mesh = prt.scene.builtin.sphere(rings=20, sectors=30)
 with visibility.Shard(int(sys.argv[2]), 3) as part:
     try:
-        visibility.precompute(mesh, size=8, path=sys.argv[1], executor=part, progress=False)
+        visibility.precompute(mesh, size=8, run=prt.Run(sys.argv[1], part))
     except visibility.UnfinishedError:
         print("unfinished")
 """
@@ -139,10 +139,10 @@ def test_processes_that_share_nothing_but_a_folder_make_the_whole(tmp_path):
     assert told == ["unfinished\n", "", "unfinished\n"]
     assert subprocess.run([*command, "2"], check=True, capture_output=True, text=True).stdout == ""
     mesh = prt.scene.builtin.sphere(rings=20, sectors=30)
-    alone = visibility.precompute(mesh, size=8, progress=False)
+    alone = visibility.precompute(mesh, size=8)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_Job, "run", None)  # Nothing is computed again.
-        found = visibility.precompute(mesh, size=8, path=path, progress=False)
+        found = visibility.precompute(mesh, size=8, run=prt.Run(path))
     np.testing.assert_array_equal(found.level, alone.level)
 
 

@@ -10,7 +10,7 @@ import pytest
 from jaxprt import visibility
 from jaxprt.scene import builtin
 from jaxprt.scene.mesh import join
-from jaxprt.visibility import StoredVisibility, precompute
+from jaxprt.visibility import Run, StoredVisibility, precompute
 
 SIZE = 8
 ALL = 6 * SIZE**2
@@ -25,7 +25,7 @@ def mesh():
 
 @pytest.fixture(scope="module")
 def transport(mesh):
-    return precompute(mesh, size=SIZE, progress=False)
+    return precompute(mesh, size=SIZE)
 
 
 def traced(mesh, *, occluder=None, size=SIZE):
@@ -90,7 +90,7 @@ def test_any_texels_of_any_vertices_are_read(mesh, transport):
     ids=["one", "named", "mask", "a block and one more", "two blocks", "none"],
 )
 def test_any_selection_of_vertices_is_lit_while_all_cast_shadows(mesh, transport, vertex):
-    some = precompute(mesh, size=SIZE, vertex=vertex, progress=False)
+    some = precompute(mesh, size=SIZE, vertex=vertex)
     number = np.arange(39)[vertex]
     np.testing.assert_array_equal(some.seen(np.arange(len(number))), transport.seen(number))
     assert some.visible(jnp.arange(5)).shape == (5, len(number))
@@ -107,7 +107,7 @@ def test_the_size_is_that_of_the_light_and_two_vertices_take_a_byte(transport):
     assert transport.size == SIZE
     # Vertices are stored by blocks of 64.
     assert transport.nbytes == ALL * visibility.rays.BLOCK // 2 == transport.level.size
-    small = precompute(builtin.plane(cells=1), size=1, progress=False)
+    small = precompute(builtin.plane(cells=1), size=1)
     assert (small.size, small.texels) == (1, 6)
     # From a plane that faces up, +y is seen whole, -y not at all.
     np.testing.assert_array_equal(small.visible(jnp.array([2, 3])), [[1] * 4, [0] * 4])
@@ -115,25 +115,25 @@ def test_the_size_is_that_of_the_light_and_two_vertices_take_a_byte(transport):
 
 def test_another_occluder_casts_the_shadows(mesh):
     sheet = builtin.plane(cells=1)
-    some = precompute(mesh, size=SIZE, occluder=sheet, progress=False)
+    some = precompute(mesh, size=SIZE, occluder=sheet)
     np.testing.assert_array_equal(some.seen(np.arange(39)), STORED[traced(mesh, occluder=sheet)])
 
 
 def test_a_store_is_resumed_and_only_what_is_missing_is_traced(mesh, tmp_path):
     path, vertex = tmp_path / "a.prt", np.resize(np.arange(39), 150)
-    whole = precompute(mesh, size=SIZE, vertex=vertex, progress=False)
-    same(precompute(mesh, size=SIZE, vertex=vertex, path=path, progress=False), whole)
+    whole = precompute(mesh, size=SIZE, vertex=vertex)
+    same(precompute(mesh, size=SIZE, vertex=vertex, run=Run(path)), whole)
     for lost, count in (((), 0), ((1,), 1), ((0, 2), 2)):
         for block in lost:
             forget(path, block)
         with Counting() as executor:
-            same(precompute(mesh, size=SIZE, vertex=vertex, path=path, executor=executor, progress=False), whole)
+            same(precompute(mesh, size=SIZE, vertex=vertex, run=Run(path, executor)), whole)
             assert executor.count == count
 
 
 def test_a_store_made_from_something_else_is_refused(mesh, tmp_path):
     path = tmp_path / "a.prt"
-    precompute(mesh, size=SIZE, path=path, progress=False)
+    precompute(mesh, size=SIZE, run=Run(path))
     for other, options in (
         (mesh, {"size": SIZE // 2}),
         (mesh, {"size": SIZE, "vertex": np.arange(38)}),
@@ -141,19 +141,19 @@ def test_a_store_made_from_something_else_is_refused(mesh, tmp_path):
         (builtin.plane(cells=6), {"size": SIZE}),
     ):
         with pytest.raises(ValueError, match=r"a\.prt holds arrays that were computed from other inputs"):
-            precompute(other, path=path, progress=False, **options)
+            precompute(other, run=Run(path), **options)
 
 
 @pytest.mark.parametrize("size", [0, -8, 12])
 def test_sizes_that_are_no_powers_of_two_are_refused(mesh, size):
     with pytest.raises(ValueError, match=f"size must be a power of two, got {size}"):
-        precompute(mesh, size=size, progress=False)
+        precompute(mesh, size=size)
 
 
 def test_vertices_that_are_not_there_are_refused(mesh):
     for vertex in (np.array([39]), np.array([0.5]), np.ones(38, bool)):
         with pytest.raises(ValueError, match=r"vertex must be a mask \[39\] or a 1-D array of indices below 39"):
-            precompute(mesh, size=SIZE, vertex=vertex, progress=False)
+            precompute(mesh, size=SIZE, vertex=vertex)
 
 
 def test_it_is_a_pytree_whose_leaves_are_its_arrays(transport):

@@ -1,9 +1,7 @@
 """Precomputes transfer tensors for one bounce and two, and patches for diffuse light of all further bounces."""
 
 import math
-import os
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from typing import Any, NamedTuple
 
 import jax
@@ -22,6 +20,7 @@ from jaxprt.systems.dynamic import BrdfSet
 from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.visibility import members
+from jaxprt.visibility.blocks import Run
 from jaxprt.visibility.rays import PRECOMPUTE
 
 ALL = "all"  # as many bounces as contribute
@@ -44,9 +43,7 @@ def precompute(
     edge: int = 8,
     size: int = 16,
     patches: int = 256,
-    path: str | os.PathLike | None = None,
-    executor: Executor | None = None,
-    progress: bool = True,
+    run: Run = Run(),
 ) -> TransferTensor:
     """Traces reflected light to every vertex, and compresses it into a transfer tensor.
 
@@ -71,9 +68,7 @@ def precompute(
         size: Edge of the cubemap faces through whose texels rays are traced.
         patches: Approximate number of patches that exchange diffuse light. They account for the spatial variation of
             textures, and for bounces after the second.
-        path: Folder in which finished work is stored. A call that was interrupted resumes from there.
-        executor: Executor that computes the blocks of work; all cores of this machine if None.
-        progress: Whether to show progress bars, and to report what is omitted.
+        run: Folder of finished work, executor and progress bars. A call that was interrupted continues from the folder.
 
     Returns:
         The tensor for all vertices.
@@ -94,14 +89,11 @@ def precompute(
     if lamps is not None:
         require.length("vertices of the lamps' transport", lamps.position, len(mesh.position))
     factor = tuple(brdf.factor if isinstance(brdf, BrdfSet) else functions.fixed_weights(brdf) for brdf in brdfs)
-    if path is not None:
-        os.makedirs(path, exist_ok=True)
-    run = _Run(path, executor, progress)
     white = np.concatenate([_white(*pair) for pair in zip(factor, weights, strict=True)])
     parts = {"lamps": 0 if lamps is None else lamps.lamps, "white": white, "scale": np.asarray(scales(factor))}
     sizes = {"components": components, "modes": min(modes, 6 * edge * edge), "size": size}
     job = _job(mesh, brdfs, np.searchsorted(numbers, mesh.region), edge, lamps, run, parts, sizes)
-    found, member = run.compute(job, "clusters", "bounce"), job.member
+    found, member = visibility.blocks.compute(job, run.within("clusters"), label="bounce"), job.member
     contribution = _contributions(found["energy"], job.scale)
     function = np.flatnonzero(contribution >= least)
     worth = [_rms(found["white"])]
@@ -120,7 +112,7 @@ def precompute(
     made = exchange.make(function, whole, None if second is None else np.asarray(second.weight), edge, lamps)
     if second is not None and bounces != 2:
         worth += exchange.worth(made, job.white[function], function, brought_twice)
-    if progress:
+    if run.progress:
         _tell(contribution, function, worth, second, bounces)
     rows = (members.places(member), job.region.astype(np.int32), areas(mesh).astype(whole.dtype))
     arrays = [jax.device_put(column) for column in (whole, core, found["mode"], *rows, function)]
@@ -135,7 +127,7 @@ def _job(
     region: np.ndarray,
     edge: int,
     lamps: LampTransport | None,
-    run: "_Run",
+    run: Run,
     parts: dict[str, Any],
     sizes: dict[str, int],
 ) -> jobs.TransferJob:
@@ -148,20 +140,6 @@ def _job(
     parts = parts | {"bases": bases, "basis": basis, "response": response, "region": region, "member": member}
     size, components, modes = sizes["size"], min(sizes["components"], member.shape[1]), sizes["modes"]
     return jobs.TransferJob.make(mesh, None, None, size, components=components, modes=modes, **parts)
-
-
-class _Run(NamedTuple):
-    """Where blocks of work are computed and stored."""
-
-    path: str | os.PathLike | None
-    executor: Executor | None
-    progress: bool
-
-    def compute(self, job: visibility.blocks.Job, name: str, label: str) -> dict[str, np.ndarray]:
-        """The results of a job, stored in a folder of the given name."""
-        store = None if self.path is None else os.path.join(self.path, name)
-        options = {"executor": self.executor, "progress": self.progress}
-        return visibility.blocks.compute(job, path=store, label=label, **options)
 
 
 class _Exchange(NamedTuple):
@@ -179,7 +157,7 @@ class _Exchange(NamedTuple):
     job: jobs.TransferJob
     wanted: int
     bounces: int | None
-    run: "_Run"
+    run: Run
 
     def make(
         self,
@@ -196,7 +174,7 @@ class _Exchange(NamedTuple):
         patch, of_region, of_cluster = patches.divide(position, normal, region, member, patches=count)
         size = self.job.size
         job = patches.PatchJob.make(self.mesh, None, None, size, patch=patch, edge=math.gcd(size, edge))
-        found = self.run.compute(job, "patches", "patches")
+        found = visibility.blocks.compute(job, self.run.within("patches"), label="patches")
         area = areas(self.mesh)
         mean = patches.Means(patch, area, len(of_region))
         place = members.places(member)
@@ -290,7 +268,7 @@ def _check_sizes(
 
 
 def _responses(
-    mesh: Mesh, bases: Sequence, kind: np.ndarray, edge: int, lamps: LampTransport | None, run: _Run
+    mesh: Mesh, bases: Sequence, kind: np.ndarray, edge: int, lamps: LampTransport | None, run: Run
 ) -> tuple[np.ndarray, ...]:
     """Response of the light factors of each basis to each texel of the environment, and to each lamp.
 
@@ -300,7 +278,7 @@ def _responses(
     for number, basis in enumerate(bases):
         vertex = np.flatnonzero(kind == number)
         job = jobs.ResponseJob.make(mesh, None, vertex, _SEEN * edge, basis=basis, edge=edge)
-        found = run.compute(job, f"response_{number}", f"response {number}")["response"]
+        found = visibility.blocks.compute(job, run.within(f"response_{number}"), label=f"response {number}")["response"]
         texels, terms = found.shape[1:]
         padded = np.zeros((shared_size(len(vertex)), terms, texels + count), found.dtype)
         padded[: len(vertex), :, :texels] = found.swapaxes(1, 2)
@@ -320,7 +298,7 @@ def _to_lamps(lamps: LampTransport, basis: SeparableBrdf, vertex: np.ndarray) ->
 
 
 def _second(
-    job: jobs.AgainJob, member: np.ndarray, white: np.ndarray, least: float, run: _Run
+    job: jobs.AgainJob, member: np.ndarray, white: np.ndarray, least: float, run: Run
 ) -> tuple[SecondBounce | None, np.ndarray]:
     """The second bounce, or None if a sample of clusters shows too little worth; and its irradiance at vertices."""
     if least > 0:
@@ -331,7 +309,7 @@ def _second(
         )
         if _rms(brought) < least:
             return None, brought
-    found = run.compute(job, "clusters_2", "bounce 2")
+    found = visibility.blocks.compute(job, run.within("clusters_2"), label="bounce 2")
     weight, lamp = found["weight"].reshape(*member.shape, -1), None
     if job.lamps:
         weight = np.concatenate([weight, found["lamp_weight"].reshape(*member.shape, -1)], -1)

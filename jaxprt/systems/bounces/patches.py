@@ -306,7 +306,7 @@ def exchange(mesh: Mesh, *, patches: int, size: int, edge: int) -> DiffuseExchan
     count = min(patches, max(1, len(position) // LEAST))
     patch, of_region, _ = divide(position, normal, region, whole, patches=count)
     job = PatchJob.make(mesh, None, None, size, patch=patch, edge=edge)
-    traced = visibility.blocks.compute(job, path=None, executor=None, progress=False, label="patches")
+    traced = visibility.blocks.compute(job, visibility.Run(progress=False), label="patches")
     factor, light = (traced[name].astype(np.float32) for name in ("factor", "light"))
     return DiffuseExchange(factor, light, Means(patch, areas(mesh), len(of_region)), of_region)
 

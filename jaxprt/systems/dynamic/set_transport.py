@@ -22,6 +22,7 @@ from jaxprt.systems.dynamic.brdf_set import BrdfSet
 from jaxprt.systems.lobe import LobeTransport, pyramid
 from jaxprt.systems.separable import ClusteredTransport, SeparableBrdf
 from jaxprt.visibility import StoredVisibility
+from jaxprt.visibility.blocks import Run
 from jaxprt.visibility.rays import PRECOMPUTE
 
 _MEMBERS = 230  # number of vertices of a cluster in a large region
@@ -129,15 +130,8 @@ def precompute_sets(
         folder = None if path is None else pathlib.Path(path) / f"region_{number}"
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
-        visible = visibility.precompute(
-            mesh,
-            size=size,
-            occluder=occluder,
-            vertex=vertex,
-            path=folder and folder / "visibility.prt",
-            executor=executor,
-            progress=progress,
-        )
+        run = Run(folder and folder / "visibility.prt", executor, progress)
+        visible = visibility.precompute(mesh, size=size, occluder=occluder, vertex=vertex, run=run)
         at = folder and folder / "clusters.prt"
         each = compress(visible, brdf, components, modes, keep, path=at, executor=executor, progress=progress)
         regions.append(RegionTransport(each.terms, each.seen, jnp.asarray(vertex, jnp.int32)))
@@ -180,9 +174,7 @@ def compress(
         components=components,
         modes=min(modes, keep, components * factors.terms),
         keep=keep,
-        path=path,
-        executor=executor,
-        progress=progress,
+        run=Run(path, executor, progress),
     )
     seen = lobe.compress(visible)
     # The diffuse part is a term, so transfer vectors are not needed. Only lobes read the pyramid's means.

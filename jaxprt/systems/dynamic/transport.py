@@ -1,9 +1,5 @@
 """Transport for BRDFs that change: the light factors, compressed by clusters of vertices, and visibility for lobes."""
 
-import os
-import pathlib
-from concurrent.futures import Executor
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +13,7 @@ from jaxprt.systems.dynamic.table import DynamicBrdf
 from jaxprt.systems.lobe import LobeTransport
 from jaxprt.systems.separable import ClusteredTransport, SeparableBrdf
 from jaxprt.visibility import StoredVisibility
+from jaxprt.visibility.blocks import Run
 from jaxprt.visibility.rays import PRECOMPUTE
 
 _MEMBERS = 230  # number of vertices of a cluster in a large mesh
@@ -67,9 +64,7 @@ def precompute(
     size: int = 64,
     occluder: Mesh | None = None,
     vertex: np.ndarray | None = None,
-    path: str | os.PathLike | None = None,
-    executor: Executor | None = None,
-    progress: bool = True,
+    run: Run = Run(),
 ) -> DynamicTransport:
     """Traces the visibility of each vertex, and compresses the transport of the light factors of a BRDF.
 
@@ -83,9 +78,7 @@ def precompute(
         size: Edge of the light's cubemap faces in texels, a power of two, at least 8.
         occluder: Mesh that casts shadows: the whole scene, or a simplified one. If None, the mesh itself.
         vertex: Indices of the vertices to precompute; all if None.
-        path: Folder in which finished work is stored. A call that was interrupted resumes from there.
-        executor: Executor that computes the blocks of work; all cores of this machine if None.
-        progress: Whether to show progress bars.
+        run: Folder of finished work, executor and progress bars. A call that was interrupted continues from the folder.
 
     Returns:
         The transport: 6 kB of pyramids for each vertex, and the terms.
@@ -98,17 +91,13 @@ def precompute(
     """
     require.kind("the BRDF", brdf, DynamicBrdf, source="jaxprt.dynamic.tabulate")
     lobe.pyramid.scales(size)
-    folder = None if path is None else pathlib.Path(path)
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-    options = {"executor": executor, "progress": progress}
-    visible = visibility.precompute(
-        mesh, size=size, occluder=occluder, vertex=vertex, path=folder and folder / "visibility.prt", **options
-    )
+    where = {"size": size, "occluder": occluder, "vertex": vertex}
+    visible = visibility.precompute(mesh, **where, run=run.within("visibility.prt"))
     sizes = {"components": components, "modes": modes, "keep": keep}
-    return compress(visible, brdf, **sizes, path=folder and folder / "clusters.prt", **options)
+    return compress(visible, brdf, **sizes, run=run.within("clusters.prt"))
 
 
+@require.arguments(**PRECOMPUTE)
 def compress(
     visible: StoredVisibility,
     brdf: DynamicBrdf,
@@ -117,9 +106,7 @@ def compress(
     modes: int = 128,
     keep: int = 1024,
     pyramid: LobeTransport | None = None,
-    path: str | os.PathLike | None = None,
-    executor: Executor | None = None,
-    progress: bool = True,
+    run: Run = Run(),
 ) -> DynamicTransport:
     """Compresses the transport of some vertices from their visibility; see `precompute`.
 
@@ -130,14 +117,11 @@ def compress(
         modes: Number of principal components over the light.
         keep: Number of wavelet coefficients of each cluster.
         pyramid: The visibility pyramids, if they exist already.
-        path: Folder in which finished work is stored.
-        executor: Executor that computes the blocks of work; all cores of this machine if None.
-        progress: Whether to show progress bars.
+        run: Folder of finished work, executor and progress bars. A call that was interrupted continues from the folder.
     """
     factors = light_factors(brdf)
     clusters, sizes = clustering(len(visible.position), factors.terms, visible.texels, components, modes, keep)
-    options = {"path": path, "executor": executor, "progress": progress}
-    terms = separable.clustered.precompute(visible, factors, clusters=clusters, **sizes, **options)
+    terms = separable.clustered.precompute(visible, factors, clusters=clusters, **sizes, run=run)
     return DynamicTransport(terms, lobe.compress(visible) if pyramid is None else pyramid)
 
 

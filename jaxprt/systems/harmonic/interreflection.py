@@ -5,9 +5,7 @@ the radiance that its corners reflect towards the vertex is interpolated; it com
 bounce. See Sloan, Kautz and Snyder 2002, section 5.
 """
 
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -24,6 +22,7 @@ from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, haar, harmonics, rotation
 from jaxprt.systems.harmonic.table import HarmonicBrdf
 from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector, check, check_memory
+from jaxprt.visibility.blocks import Run
 from jaxprt.visibility.rays import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
@@ -39,9 +38,7 @@ def interreflect(
     *,
     bounces: int = 1,
     size: int = 16,
-    path: str | os.PathLike | None = None,
-    executor: Executor | None = None,
-    progress: bool = True,
+    run: Run = Run(),
 ) -> TransferMatrix:
     """Adds light reflected between surfaces to transfer matrices. The BRDFs that reflect it are fixed here.
 
@@ -51,10 +48,7 @@ def interreflect(
         brdf: BRDF table of each region of the mesh, of the same degree as the transport and without parameters.
         bounces: Number of reflections before light arrives at a vertex.
         size: Edge of the cubemap faces through whose texels rays are traced, in texels.
-        path: Folder in which finished blocks of every bounce are stored. A call that was interrupted continues from
-            there.
-        executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
-        progress: Whether to show a progress bar.
+        run: Folder of finished work, executor and progress bars. A call that was interrupted continues from the folder.
 
     Returns:
         Transfer that includes the bounces. It has colors if a BRDF has.
@@ -79,8 +73,7 @@ def interreflect(
     for number in range(bounces):
         job = _BounceJob.make(mesh, None, None, size, brdf=tuple(brdf), rows=np.ascontiguousarray(last))
         label = f"bounce {number + 1}"
-        store = None if path is None else os.path.join(path, f"bounce_{number + 1}")
-        last = visibility.blocks.compute(job, path=store, executor=executor, progress=progress, label=label)["matrix"]
+        last = visibility.blocks.compute(job, run.within(f"bounce_{number + 1}"), label=label)["matrix"]
         total = total + last
     return TransferMatrix(jnp.asarray(total), transport.position, transport.frame)
 
@@ -93,9 +86,7 @@ def interreflect_diffuse(
     *,
     bounces: int = 1,
     size: int = 16,
-    path: str | os.PathLike | None = None,
-    executor: Executor | None = None,
-    progress: bool = True,
+    run: Run = Run(),
 ) -> TransferVector:
     """Adds light reflected between diffuse surfaces to transfer vectors.
 
@@ -105,10 +96,7 @@ def interreflect_diffuse(
         albedo: Albedo of each region r of the mesh, gray or per color.
         bounces: Number of reflections before light arrives at a vertex.
         size: Edge of the cubemap faces through whose texels rays are traced, in texels.
-        path: Folder in which finished blocks of every bounce are stored. A call that was interrupted continues from
-            there.
-        executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
-        progress: Whether to show a progress bar.
+        run: Folder of finished work, executor and progress bars. A call that was interrupted continues from the folder.
 
     Raises:
         ValueError: The transport has other vertices, a region has no albedo, an albedo is not finite, or `bounces` is
@@ -129,8 +117,7 @@ def interreflect_diffuse(
         rows = np.ascontiguousarray((last * albedo[np.asarray(mesh.region)].T).transpose(2, 1, 0))
         job = _DiffuseBounceJob.make(mesh, None, None, size, rows=rows, albedo=albedo)
         label = f"bounce {number + 1}"
-        store = None if path is None else os.path.join(path, f"bounce_{number + 1}")
-        last = visibility.blocks.compute(job, path=store, executor=executor, progress=progress, label=label)["vector"]
+        last = visibility.blocks.compute(job, run.within(f"bounce_{number + 1}"), label=label)["vector"]
         total = total + last
     return TransferVector(jnp.asarray(total), transport.position)
 

@@ -5,9 +5,7 @@ the vertex's frame. The dot product of these with a BRDF's coefficients is radia
 the same for an ideal diffuse surface of albedo 1: its dot product with the light is radiance.
 """
 
-import os
 from collections.abc import Mapping
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -23,6 +21,7 @@ from jaxprt.compile import jit
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar, harmonics, rotation
+from jaxprt.visibility.blocks import Run
 from jaxprt.visibility.rays import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
@@ -76,9 +75,7 @@ def precompute(
     occluder: Mesh | None = None,
     vertex: np.ndarray | None = None,
     apart: bool = False,
-    path: str | os.PathLike | None = None,
-    executor: Executor | None = None,
-    progress: bool = True,
+    run: Run = Run(),
 ) -> TransferMatrix:
     """Precomputes transfer matrices with self-shadowing, for any BRDF.
 
@@ -89,9 +86,7 @@ def precompute(
         occluder: Mesh that casts shadows, such as the whole scene or a simplified one; the mesh itself if None.
         vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
         apart: Whether the regions of the mesh are separate surfaces: rays start off the faces of their own region.
-        path: Folder in which finished blocks are stored. A call that was interrupted continues from there.
-        executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
-        progress: Whether to show a progress bar.
+        run: Folder of finished work, executor and progress bars. A call that was interrupted continues from the folder.
 
     Raises:
         ValueError: The degree or the size is out of range, positions or normals are not finite, or the folder holds
@@ -104,9 +99,9 @@ def precompute(
     Reference: Kautz, Sloan, Snyder 2002, section 5.
     """
     check(degree, size)
-    check_memory(len(visibility.rays.vertex_indices(mesh, vertex)), degree, in_files=path is not None)
+    check_memory(len(visibility.rays.vertex_indices(mesh, vertex)), degree, in_files=run.path is not None)
     job = _Job.make(mesh, occluder, vertex, size, apart=apart, degree=degree, diffuse=False)
-    result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress)
+    result = visibility.blocks.compute(job, run)
     position = visibility.rays.place(mesh, vertex)
     return TransferMatrix(jax.device_put(result["matrix"]), position, jax.device_put(job.frame))
 
@@ -120,9 +115,7 @@ def precompute_diffuse(
     occluder: Mesh | None = None,
     vertex: np.ndarray | None = None,
     apart: bool = False,
-    path: str | os.PathLike | None = None,
-    executor: Executor | None = None,
-    progress: bool = True,
+    run: Run = Run(),
 ) -> TransferVector:
     """Precomputes transfer vectors with self-shadowing, for ideal diffuse surfaces.
 
@@ -133,9 +126,7 @@ def precompute_diffuse(
         occluder: Mesh that casts shadows, such as the whole scene or a simplified one; the mesh itself if None.
         vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
         apart: Whether the regions of the mesh are separate surfaces: rays start off the faces of their own region.
-        path: Folder in which finished blocks are stored. A call that was interrupted continues from there.
-        executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
-        progress: Whether to show a progress bar.
+        run: Folder of finished work, executor and progress bars. A call that was interrupted continues from the folder.
 
     Raises:
         ValueError: The degree or the size is out of range, positions or normals are not finite, or the folder holds
@@ -147,7 +138,7 @@ def precompute_diffuse(
     """
     check(degree, size)
     job = _Job.make(mesh, occluder, vertex, size, apart=apart, degree=degree, diffuse=True)
-    result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress)
+    result = visibility.blocks.compute(job, run)
     return TransferVector(jax.device_put(result["vector"]), visibility.rays.place(mesh, vertex))
 
 

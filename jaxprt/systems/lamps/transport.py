@@ -12,9 +12,7 @@ surfaces show the lamp's shape.
 """
 
 import dataclasses
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -28,6 +26,7 @@ from jaxprt.files.arrays import Layout, sketch
 from jaxprt.scene import origin as origins
 from jaxprt.scene.mesh import Mesh, relative
 from jaxprt.scene.scene import PointLight
+from jaxprt.visibility.blocks import Run
 from jaxprt.visibility.occluder import offsets
 from jaxprt.visibility.rays import PRECOMPUTE
 
@@ -92,9 +91,7 @@ def precompute(
     occluder: Mesh | None = None,
     vertex: np.ndarray | None = None,
     apart: bool = False,
-    path: str | os.PathLike | None = None,
-    executor: Executor | None = None,
-    progress: bool = True,
+    run: Run = Run(),
 ) -> LampTransport:
     """Precomputes the visible part of each lamp at each vertex of a mesh, by ray tracing.
 
@@ -109,9 +106,7 @@ def precompute(
         occluder: Mesh that casts shadows, such as the whole scene with or without the lamps; the mesh itself if None.
         vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
         apart: Whether the regions of the mesh are separate surfaces: rays start off the faces of their own region.
-        path: Folder in which finished blocks are stored. A call that was interrupted continues from there.
-        executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
-        progress: Whether to show a progress bar.
+        run: Folder of finished work, executor and progress bars. A call that was interrupted continues from the folder.
 
     Raises:
         TypeError: A lamp is neither a `Mesh` nor a `PointLight`.
@@ -132,7 +127,7 @@ def precompute(
     coarse, fine = (_Samples.of(lamps, count, pieces) for count in (samples, _FINER * samples))
     lamp = [number for number, each in enumerate(lamps) for _ in range(pieces if isinstance(each, Mesh) else 1)]
     job = _Job.make(mesh, occluder, vertex, 1, apart=apart, coarse=coarse, fine=fine)
-    found = visibility.blocks.compute(job, path=path, executor=executor, progress=progress, label="lamps")["moment"]
+    found = visibility.blocks.compute(job, run, label="lamps")["moment"]
     solid, cosine, *direction = (jax.device_put(np.ascontiguousarray(each.T)) for each in np.moveaxis(found, 2, 0))
     position, frame = visibility.rays.place(mesh, vertex), jax.device_put(job.frame)
     return LampTransport(solid, cosine, jnp.stack(direction, 1), position, frame, tuple(lamp))

@@ -4,9 +4,7 @@ A pyramid stores the visibility of cubemap texels as one bit each, and means ove
 visibility of a lobe is read from a few texels at the scale of its width. Pyramids do not depend on the BRDF.
 """
 
-import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import lru_cache, partial, reduce
 from typing import Any, NamedTuple
@@ -25,6 +23,7 @@ from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap, haar
 from jaxprt.systems.lobe import diffuse
 from jaxprt.visibility import StoredVisibility
+from jaxprt.visibility.blocks import Run
 from jaxprt.visibility.rays import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
@@ -317,9 +316,7 @@ def precompute(
     occluder: Mesh | None = None,
     vertex: np.ndarray | None = None,
     apart: bool = False,
-    path: str | os.PathLike | None = None,
-    executor: Executor | None = None,
-    progress: bool = True,
+    run: Run = Run(),
 ) -> LobeTransport:
     """Precomputes the visibility pyramid of every vertex by ray tracing, for any BRDF.
 
@@ -331,9 +328,7 @@ def precompute(
         occluder: Mesh that casts shadows, such as the whole scene or a simplified one; the mesh itself if None.
         vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
         apart: Whether the regions of the mesh are separate surfaces: rays start off the faces of their own region.
-        path: Folder in which finished blocks are stored. A call that was interrupted continues from there.
-        executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
-        progress: Whether to show a progress bar.
+        run: Folder of finished work, executor and progress bars. A call that was interrupted continues from the folder.
 
     Returns:
         Pyramids and transfer vectors of the vertices.
@@ -346,7 +341,7 @@ def precompute(
     """
     scales(size)
     job = _Job.make(mesh, occluder, vertex, size, apart=apart)
-    result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress, label="visibility")
+    result = visibility.blocks.compute(job, run, label="visibility")
     position = visibility.rays.place(mesh, vertex)
     levels, vector, frame = (jax.device_put(array) for array in (result["pyramid"], result["vector"], job.frame))
     return LobeTransport(levels, vector, position, frame, size)

@@ -7,9 +7,7 @@ its coefficients, called modes. A change of light evaluates the modes once per c
 per component and vertex, instead of `keep` sparse coefficients.
 """
 
-import os
 from collections.abc import Mapping
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -28,6 +26,8 @@ from jaxprt.sphere import haar
 from jaxprt.systems.separable import sparse
 from jaxprt.systems.separable.factorization import SeparableBrdf, mark_of
 from jaxprt.visibility import StoredVisibility, members
+from jaxprt.visibility.blocks import Run
+from jaxprt.visibility.rays import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "clustered": 1}
@@ -166,6 +166,7 @@ def _read(transport: ClusteredTransport) -> Array:
     return transport.place[transport.vertex] == jnp.arange(len(transport.vertex))
 
 
+@require.arguments(**PRECOMPUTE)
 def precompute(
     direct: StoredVisibility,
     brdf: SeparableBrdf,
@@ -175,9 +176,7 @@ def precompute(
     components: int | None = None,
     modes: int | None = None,
     keep: int | None = None,
-    path: str | os.PathLike | None = None,
-    executor: Executor | None = None,
-    progress: bool = True,
+    run: Run = Run(),
 ) -> ClusteredTransport:
     """Computes and compresses the transport of a mesh. Only one cluster at a time is held uncompressed.
 
@@ -193,9 +192,7 @@ def precompute(
             whichever is smaller.
         modes: Number of modes of the light per cluster. If None, 128 or as many as there are.
         keep: Number of wavelet coefficients of the light per cluster. If None, 1024 or as many as there are.
-        path: Folder in which finished clusters are stored. A call that was interrupted continues from there.
-        executor: A `concurrent.futures.Executor` that computes the clusters; if None, the cores of this machine.
-        progress: Whether to show a progress bar.
+        run: Folder of finished work, executor and progress bars. A call that was interrupted continues from the folder.
 
     Returns:
         The compressed transport of every vertex.
@@ -237,7 +234,7 @@ def precompute(
         most = min(keep, components * brdf.terms)
         raise ValueError(f"modes must be between 1 and the smaller of keep and components x terms, {most}, got {modes}")
     job = _Job(jax.tree.map(np.asarray, direct), jax.tree.map(np.asarray, brdf), member, components, modes, keep)
-    result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress, label="compress")
+    result = visibility.blocks.compute(job, run, label="compress")
     index, mode, core = (jax.device_put(result[name]) for name in ("index", "mode", "core"))
     weight = jax.device_put(result["weight"]).reshape(*member.shape, components)
     row, place = member.ravel(), members.places(member)

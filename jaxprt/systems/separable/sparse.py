@@ -3,9 +3,7 @@
 The largest coefficients of each vertex and term are stored, padded to rows of equal length.
 """
 
-import os
 from collections.abc import Mapping
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -22,6 +20,7 @@ from jaxprt.files.arrays import Layout, sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.systems.separable.factorization import SeparableBrdf, mark_of
+from jaxprt.visibility.blocks import Run
 from jaxprt.visibility.rays import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
@@ -208,9 +207,7 @@ def precompute(
     size: int = 64,
     occluder: Mesh | None = None,
     vertex: np.ndarray | None = None,
-    path: str | os.PathLike | None = None,
-    executor: Executor | None = None,
-    progress: bool = True,
+    run: Run = Run(),
 ) -> SparseTransport:
     """Precomputes the transport of a mesh with self-shadowing, for a factored BRDF.
 
@@ -221,11 +218,7 @@ def precompute(
         size: Edge of the light's cubemap faces in texels; a power of two.
         occluder: Mesh that casts shadows, such as the whole scene or a simplified one; the mesh itself if None.
         vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
-        path: Folder in which finished blocks are stored; it is created with its parents. A call that was interrupted
-            continues from there.
-        executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine. Process
-            pools must have the context "spawn": forked processes hang where JAX runs.
-        progress: Whether to show a progress bar.
+        run: Folder of finished work, executor and progress bars. A call that was interrupted continues from the folder.
 
     Returns:
         The transport of every vertex.
@@ -246,7 +239,7 @@ def precompute(
     if not 1 <= keep <= 6 * size * size:
         raise ValueError(f"keep must be at most {6 * size * size} and at least 1, got {keep}")
     job = _Job.make(mesh, occluder, vertex, size, brdf=jax.tree.map(np.asarray, brdf), keep=keep)
-    result = visibility.blocks.compute(job, path=path, executor=executor, progress=progress)
+    result = visibility.blocks.compute(job, run)
     share = rms(result["index"], result["value"], 6 * size * size)
     index, value = jax.device_put(result["index"]), jax.device_put(result["value"])
     position, frame = visibility.rays.place(mesh, vertex), jax.device_put(job.frame)

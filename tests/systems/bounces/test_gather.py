@@ -30,7 +30,7 @@ def frame(mesh):
 
 @pytest.fixture(scope="module")
 def seen(mesh):
-    visible = visibility.precompute(mesh, size=SIZE, progress=False)
+    visible = visibility.precompute(mesh, size=SIZE)
     return jnp.asarray(visible.seen(np.arange(len(mesh.position))))
 
 
@@ -73,8 +73,8 @@ def test_bounces_between_diffuse_regions_are_those_of_the_harmonic_system(mesh, 
     white = bounces.functions.basis(separable.factor(Lambert(1.0), terms=1, resolution=8))
     response = jnp.sum(bounces.gather.respond(seen, frame, white, edge=EDGE), 1, keepdims=True)
     found = sum(arrived(response, frame, white, met[r], flux(mesh))[:, 0, 0] * ALBEDO[r] for r in (0, 1))
-    plain = harmonic.precompute_diffuse(mesh, degree=0, size=SIZE, progress=False)
-    options = {"bounces": 1, "size": SIZE, "progress": False}
+    plain = harmonic.precompute_diffuse(mesh, degree=0, size=SIZE)
+    options = {"bounces": 1, "size": SIZE}
     once = harmonic.interreflect_diffuse(mesh, plain, ALBEDO, **options)
     exact = np.asarray(once.vector - plain.vector)[0].T * np.sqrt(4 * np.pi)
     assert np.abs(exact).max() > 0.1
@@ -117,8 +117,8 @@ def test_two_bounces_are_nearly_those_of_the_harmonic_system(mesh, seen, frame, 
     arriving = sum(arrived(response, frame, white, met[r], shining(3))[:, :, 0] * ALBEDO[r] for r in (0, 1))
     again = bounces.gather.respond_again(jnp.asarray(np.moveaxis(arriving, 0, -1)), frame, white)
     found = sum(arrived(again, frame, white, met[r], flux(mesh))[:, 0, 0] * ALBEDO[r] for r in (0, 1))
-    plain = harmonic.precompute_diffuse(mesh, degree=0, size=SIZE, progress=False)
-    options = {"size": SIZE, "progress": False}
+    plain = harmonic.precompute_diffuse(mesh, degree=0, size=SIZE)
+    options = {"size": SIZE}
     one, two = (harmonic.interreflect_diffuse(mesh, plain, ALBEDO, bounces=n, **options) for n in (1, 2))
     exact = np.asarray(two.vector - one.vector)[0].T * np.sqrt(4 * np.pi)
     assert relative(found, exact) < 0.011

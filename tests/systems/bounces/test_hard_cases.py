@@ -13,7 +13,7 @@ from jaxprt.sphere import cubemap
 
 SIZE = 8
 REGION = 64  # vertices
-OPTIONS = {"components": 16, "modes": 24, "edge": 2, "size": 8, "progress": False}
+OPTIONS = {"components": 16, "modes": 24, "edge": 2, "size": 8}
 ONES = Environment(jax.device_put(np.ones((6, SIZE, SIZE, 1), np.float32)))
 EYE = jnp.array([1.0, 4.0, 3.0])
 

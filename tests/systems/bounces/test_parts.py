@@ -69,7 +69,7 @@ class Reflected(NamedTuple):
 def made(mesh: Mesh, brdfs: list, *, count: int = 1, terms: int = 8) -> Reflected:
     """Reflected light between the regions of a mesh."""
     factored = [separable.factor(each, terms=terms, resolution=16) for each in brdfs]
-    sizes = {"components": 40, "modes": 24, "edge": 2, "size": 16, "progress": False}
+    sizes = {"components": 40, "modes": 24, "edge": 2, "size": 16}
     tensor = bounces.precompute(mesh, factored, bounces=count, **sizes)
     frame = directions.frame(mesh.normal, mesh.tangent)
     own = [np.asarray(mesh.region) == number for number in range(len(brdfs))]

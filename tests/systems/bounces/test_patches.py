@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("coarse")
 
 EYE = jnp.array([0.3, 3.0, 0.2])
 SKY = Environment(jnp.ones((6, 8, 8, 3)))
-OPTIONS = {"components": 40, "modes": 24, "edge": 2, "size": 16, "progress": False}
+OPTIONS = {"components": 40, "modes": 24, "edge": 2, "size": 16}
 
 
 @functools.cache

@@ -43,7 +43,7 @@ def transport(mesh, brdfs):
 @pytest.fixture(scope="module")
 def tensor(mesh, brdfs):
     along = bounces.factor(MEMBERS, functions=2, terms=8, resolution=12)
-    options = {"components": 10**6, "modes": 10**6, "edge": 4, "size": 8, "progress": False}
+    options = {"components": 10**6, "modes": 10**6, "edge": 4, "size": 8}
     return bounces.precompute(mesh, [along, brdfs[1]], **options)
 
 
@@ -110,16 +110,16 @@ def test_a_white_world_is_that_of_the_harmonic_system_and_nearly_invisible(mesh)
     """White surfaces under constant light: what two bounces leave of radiance one is little."""
     white = separable.factor(Lambert(1.0), terms=1, resolution=4)
     transport = dynamic.precompute_sets(mesh, [white, white], size=SIZE, progress=False)
-    tensor = bounces.precompute(mesh, [white, white], edge=4, components=136, modes=96, size=8, progress=False)
+    tensor = bounces.precompute(mesh, [white, white], edge=4, components=136, modes=96, size=8)
     ones = Environment(jnp.ones((6, SIZE, SIZE, 1)))
     eye = jnp.array([0.0, 50.0, 0.0])
     facing = np.asarray(mesh.normal)[:, 1] > 0.1
     arguments = ([white, white], [None, None], ones)
     first = np.asarray(dynamic.radiance(transport, *arguments, eye=eye, texels=0))[facing, 0]
     both = np.asarray(bounces.radiance(transport, tensor, *arguments, eye=eye, texels=0))[facing, 0]
-    plain = harmonic.precompute_diffuse(mesh, degree=0, size=SIZE, progress=False)
+    plain = harmonic.precompute_diffuse(mesh, degree=0, size=SIZE)
     albedo = np.ones((2, 1), np.float32)
-    exact = harmonic.interreflect_diffuse(mesh, plain, albedo, bounces=2, size=SIZE, progress=False)
+    exact = harmonic.interreflect_diffuse(mesh, plain, albedo, bounces=2, size=SIZE)
     exact = np.asarray(exact.vector)[0, 0, facing] * np.sqrt(4 * np.pi)
     without, left = 1 - first, 1 - both
     assert without.max() > 0.4

@@ -14,6 +14,7 @@ from jaxprt.scene import Environment, builtin
 from jaxprt.scene.mesh import ground_plane, join, make_mesh
 from jaxprt.sphere import cubemap, directions, haar, harmonics
 from jaxprt.systems.bounces.relight import LitTransfer
+from jaxprt.visibility import Run
 
 # Edges of cubemap faces: EDGE divides the light, SIZE the rays between surfaces, SEEN the visibility of the light.
 EDGE, SIZE, SEEN = 4, 8, 16
@@ -38,7 +39,7 @@ def brdfs():
 @pytest.fixture(scope="module")
 def whole(mesh, brdfs):
     """Nothing left out but by half precision."""
-    return bounces.precompute(mesh, brdfs, components=ALL, modes=ALL, edge=EDGE, size=SIZE, progress=False)
+    return bounces.precompute(mesh, brdfs, components=ALL, modes=ALL, edge=EDGE, size=SIZE)
 
 
 def light(seed, edge=EDGE):
@@ -67,13 +68,13 @@ def test_bounces_under_constant_light_are_those_of_the_harmonic_system():
     mesh = join([ball, ground_plane(ball, vertices=64)])
     albedo = np.array([[0.9, 0.5, 0.2], [0.3, 0.6, 0.8]], np.float32)
     fixed = [separable.factor(Lambert(each), terms=1, resolution=8) for each in albedo]
-    tensor = bounces.precompute(mesh, fixed, components=ALL, modes=ALL, edge=EDGE, size=SEEN, progress=False)
+    tensor = bounces.precompute(mesh, fixed, components=ALL, modes=ALL, edge=EDGE, size=SEEN)
     assert tensor.error.max() < 1e-3
     once, twice = arriving(tensor, Environment(jnp.ones((6, EDGE, EDGE, 3))))
     cosine = np.pi * np.array([1, 2 / 3, 1 / 4, 0])[[0, *[1] * 3, *[2] * 5, *[3] * 7]]
     at = np.asarray(harmonics.evaluate(mesh.normal, degree=3)) * cosine / np.pi
-    plain = harmonic.precompute_diffuse(mesh, degree=0, size=SEEN, progress=False)
-    options = {"size": SEEN, "progress": False}
+    plain = harmonic.precompute_diffuse(mesh, degree=0, size=SEEN)
+    options = {"size": SEEN}
     one, two = (harmonic.interreflect_diffuse(mesh, plain, albedo, bounces=n, **options) for n in (1, 2))
     exact = [np.asarray(b.vector - a.vector)[0].T * np.sqrt(4 * np.pi) for a, b in ((plain, one), (one, two))]
     assert relative(np.einsum("vs,vsc->vc", at, once), exact[0]) < 0.014
@@ -86,7 +87,7 @@ def test_bounces_under_constant_light_are_those_of_the_harmonic_system():
 
 def test_two_bounces_are_a_loop_over_rays_of_rays(mesh, brdfs, whole):
     """From one texel, by glossy and diffuse surfaces, without harmonics between: these leave some percent."""
-    seen = visibility.precompute(mesh, size=SEEN, progress=False).seen(np.arange(len(mesh.position)))
+    seen = visibility.precompute(mesh, size=SEEN).seen(np.arange(len(mesh.position)))
     frame = np.asarray(directions.frame(mesh.normal, mesh.tangent))
     occluder = visibility.Occluder(mesh)
     start, normal, region = visibility.start_points(mesh, occluder), np.asarray(mesh.normal), np.asarray(mesh.region)
@@ -197,7 +198,7 @@ def test_diffuse_surfaces_exchange_light_reciprocally():
 
 
 def test_fewer_components_and_modes_err_as_they_say(mesh, brdfs, whole):
-    options = {"edge": EDGE, "size": SIZE, "progress": False}
+    options = {"edge": EDGE, "size": SIZE}
     cut = bounces.precompute(mesh, brdfs, components=20, modes=24, bounces=1, **options)
     # Without patches, of which components are a small part.
     short, long = (eqx.tree_at(lambda each: each.patches, each, None).nbytes for each in (cut, whole))
@@ -224,7 +225,7 @@ def changing():
 def test_what_brings_little_is_left_out_and_told(mesh, changing, capsys):
     dark = separable.factor(Lambert(0.01), terms=1, resolution=8)
     options = {"components": 8, "modes": 8, "edge": 2, "size": 8}
-    every = bounces.precompute(mesh, [changing, dark], progress=False, **options)
+    every = bounces.precompute(mesh, [changing, dark], **options)
     few = bounces.precompute(mesh, [changing, dark], least=0.05, **options)
     assert len(every.function) == 4
     assert every.second is not None
@@ -245,7 +246,7 @@ def test_channels_with_weights_are_worth_what_the_brdf_is_that_they_add_up_to(me
     whole = CookTorrance(**glossy | {"diffuse": 0.4 + 0.5 * 0.3, "specular": 0.5 * 0.7})
     brdfs = Channels((Lambert(1.0), CookTorrance(**glossy)), jnp.ones(2)), whole
     channels, alone = (separable.factor(each, terms=8, resolution=12) for each in brdfs)
-    options = {"components": ALL, "modes": ALL, "edge": 2, "size": 8, "progress": False}
+    options = {"components": ALL, "modes": ALL, "edge": 2, "size": 8}
     exact = bounces.precompute(mesh, [alone, alone], **options).worth
     found = bounces.precompute(mesh, [alone, channels], weights=[None, weight], **options).worth
     np.testing.assert_allclose(found, exact, rtol=0.01)
@@ -283,7 +284,7 @@ def test_the_middle_of_a_sun_stays_in_place(size):
 
 
 def test_a_stopped_precomputation_goes_on(mesh, brdfs, tmp_path):
-    options = {"components": 8, "modes": 8, "edge": 2, "size": 8, "progress": False, "path": tmp_path / "bounce"}
+    options = {"components": 8, "modes": 8, "edge": 2, "size": 8, "run": Run(tmp_path / "bounce")}
     first, again = (bounces.precompute(mesh, brdfs, **options) for _ in range(2))
     np.testing.assert_array_equal(first.core, again.core)
     np.testing.assert_array_equal(first.second.core, again.second.core)
@@ -293,22 +294,22 @@ def test_a_stopped_precomputation_goes_on(mesh, brdfs, tmp_path):
 
 def test_what_makes_no_tensor_is_refused(mesh, brdfs):
     with pytest.raises(ValueError, match=r"one for each of the regions \[0, 1\], got 1"):
-        bounces.precompute(mesh, brdfs[:1], progress=False)
+        bounces.precompute(mesh, brdfs[:1])
     with pytest.raises(ValueError, match="a power of two, got 0, 64, 8 and 16"):
-        bounces.precompute(mesh, brdfs, components=0, progress=False)
+        bounces.precompute(mesh, brdfs, components=0)
     with pytest.raises(ValueError, match="a power of two, got 32, 64, 6 and 16"):
-        bounces.precompute(mesh, brdfs, edge=6, progress=False)
+        bounces.precompute(mesh, brdfs, edge=6)
     with pytest.raises(ValueError, match="bounces must be a whole number of at least 1, or 'all', got 0"):
-        bounces.precompute(mesh, brdfs, bounces=0, progress=False)
+        bounces.precompute(mesh, brdfs, bounces=0)
     with pytest.raises(ValueError, match="patches must be at least 1, got 0"):
-        bounces.precompute(mesh, brdfs, patches=0, progress=False)
+        bounces.precompute(mesh, brdfs, patches=0)
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_weights_of_other_regions_and_channels_are_refused(mesh, brdfs, changing):
     def refused(weights, message, brdfs=brdfs):
         with pytest.raises(ValueError, match=message):
-            bounces.precompute(mesh, brdfs, weights=weights, progress=False)
+            bounces.precompute(mesh, brdfs, weights=weights)
 
     refused([None], "weights must have one entry, an array or None, for each of 2 regions, got 1")
     refused([None, jnp.ones((2, 3))], r"the weights of region 1 must be \[3 channels, c\], got \[2, 3\]")

@@ -27,7 +27,7 @@ def seen():
     ball, floor = builtin.sphere(rings=10, sectors=16), builtin.plane(cells=6)
     position = ball.position + np.array([0, 0.9, 0], np.float32)
     mesh = prt.scene.mesh.join([dataclasses.replace(ball, position=position), floor])
-    return visibility.precompute(mesh, size=SIZE, progress=False)
+    return visibility.precompute(mesh, size=SIZE)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ BRDFS = {
 @pytest.fixture(scope="module", params=BRDFS)
 def system(request, seen):
     brdf = BRDFS[request.param]()
-    transport = dynamic.compress(seen, brdf, components=24, modes=128, keep=1024, progress=False)
+    transport = dynamic.compress(seen, brdf, components=24, modes=128, keep=1024)
     return request.param, dynamic.DynamicSystem(transport, brdf)
 
 
@@ -117,7 +117,7 @@ def test_points_with_a_tilted_normal_reflect_around_it(seen, system):
 
 def test_transport_of_another_brdf_is_refused(seen):
     one, other = (dynamic.tabulate(prt.brdf.GGX(1.0, r), lobes=0, ranks=(1, 4, 4)) for r in (0.4, 0.6))
-    transport = dynamic.compress(seen, one, progress=False)
+    transport = dynamic.compress(seen, one)
     with pytest.raises(ValueError, match="light factors differ"):
         dynamic.DynamicSystem(transport, other)
     with pytest.raises(ValueError, match="must have the transport's 4 light factors, got 0"):

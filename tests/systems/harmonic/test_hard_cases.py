@@ -140,20 +140,20 @@ def test_constant_light_through_the_whole_system_is_the_albedo(lambert, degree):
     light = harmonic.project(WHITE, degree=degree)
     color = np.asarray(unshadowed_radiance(mesh, table, light, eye=EYE))
     np.testing.assert_allclose(color, np.tile(albedo, (len(color), 1)), atol=1e-3)
-    transport = precompute(mesh, degree=degree, size=SIZE, progress=False)
+    transport = precompute(mesh, degree=degree, size=SIZE)
     through = np.asarray(relight(transport, table, light, eye=EYE))
     np.testing.assert_allclose(through, color, atol=FURNACE)
 
 
 def test_constant_light_on_open_diffuse_vertices_is_the_albedo():
-    vector = precompute_diffuse(sphere(), size=SIZE, progress=False)
+    vector = precompute_diffuse(sphere(), size=SIZE)
     light = harmonic.project(WHITE, degree=4)
     np.testing.assert_allclose(diffuse(vector, jnp.full(1, 0.7), light), 0.7, atol=FURNACE)
 
 
 def test_constant_light_is_never_amplified(mirror, lambert):
     light = harmonic.project(WHITE, degree=4)
-    transport = precompute(scene(), size=SIZE, progress=False)
+    transport = precompute(scene(), size=SIZE)
     for table in (mirror, lambert):
         for color in (
             relight(transport, table, light, eye=EYE),
@@ -165,24 +165,22 @@ def test_constant_light_is_never_amplified(mirror, lambert):
 
 def test_vertices_that_see_nothing_are_black(lambert, mirror):
     mesh, light = box(), jnp.asarray(np.random.default_rng(0).normal(size=(25, 3)), jnp.float32)
-    transport = precompute(mesh, size=8, progress=False)
+    transport = precompute(mesh, size=8)
     np.testing.assert_array_equal(transport.matrix, 0)
     for table in (lambert, mirror):
         color = relight(transport, table, light, eye=jnp.array([0.1, 0.2, 0.1]))
         np.testing.assert_array_equal(color, 0)
-        np.testing.assert_array_equal(
-            interreflect(mesh, transport, [table], bounces=2, size=8, progress=False).matrix, 0
-        )
-    vector = precompute_diffuse(mesh, size=8, progress=False)
+        np.testing.assert_array_equal(interreflect(mesh, transport, [table], bounces=2, size=8).matrix, 0)
+    vector = precompute_diffuse(mesh, size=8)
     np.testing.assert_array_equal(vector.vector, 0)
-    bounced = interreflect_diffuse(mesh, vector, np.ones((1, 1)), bounces=2, size=8, progress=False)
+    bounced = interreflect_diffuse(mesh, vector, np.ones((1, 1)), bounces=2, size=8)
     np.testing.assert_array_equal(bounced.vector, 0)
 
 
 def test_a_lone_triangle_has_nothing_to_bounce(lambert):
     mesh = make_mesh(np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0.0]]), np.array([[0, 1, 2]]))
-    transport = precompute(mesh, size=8, progress=False)
-    same = interreflect(mesh, transport, [lambert], bounces=2, size=8, progress=False)
+    transport = precompute(mesh, size=8)
+    same = interreflect(mesh, transport, [lambert], bounces=2, size=8)
     np.testing.assert_array_equal(same.matrix, transport.matrix)
 
 
@@ -276,7 +274,7 @@ def test_mirrors_show_the_light_itself(mirror, close):
 def test_views_below_the_horizon_see_what_grazing_views_see_with_and_without_transfer(lambert):
     mesh = builtin.plane(cells=2)
     light = harmonic.project(WHITE, degree=4)
-    transport = precompute(mesh, size=8, progress=False)
+    transport = precompute(mesh, size=8)
     for height in (1e-30, 1e-3, 0.0, -1e-6, -5.0):
         eye = jnp.array([50.0, height, 3.0])
         for color in (
@@ -291,7 +289,7 @@ def test_one_coefficient_is_the_mean_of_the_light():
     table = tabulate(Phong(diffuse=0.5, specular=0.3), degree=0, resolution=4)
     assert table.degree == 0
     light = harmonic.project(sun(), degree=0)
-    transport = precompute(mesh, degree=0, size=8, progress=False)
+    transport = precompute(mesh, degree=0, size=8)
     np.testing.assert_allclose(transport.matrix, 1, atol=0.01)
     color = relight(transport, table, light, eye=EYE)
     assert np.isfinite(np.asarray(color)).all()

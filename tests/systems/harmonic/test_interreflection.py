@@ -59,7 +59,7 @@ def vector_of(mesh, value):
 
 def bounce(mesh, value, albedo, *, size=64, bounces=1):
     transport = vector_of(mesh, value)
-    total = interreflect_diffuse(mesh, transport, albedo, bounces=bounces, size=size, progress=False)
+    total = interreflect_diffuse(mesh, transport, albedo, bounces=bounces, size=size)
     return np.asarray(total.vector - transport.vector)[0, 0]
 
 
@@ -76,12 +76,12 @@ def mesh():
 
 @pytest.fixture(scope="module")
 def matrix(mesh):
-    return precompute(mesh, size=SIZE, progress=False)
+    return precompute(mesh, size=SIZE)
 
 
 @pytest.fixture(scope="module")
 def vector(mesh):
-    return precompute_diffuse(mesh, size=SIZE, progress=False)
+    return precompute_diffuse(mesh, size=SIZE)
 
 
 @pytest.fixture(scope="module")
@@ -169,9 +169,9 @@ def grid_faces(rows, columns):
 
 def test_white_surfaces_in_a_white_furnace_vanish_as_bounces_grow():
     mesh, size, before = ball_and_ground(8, 12, 8), 16, None
-    vector = precompute_diffuse(mesh, size=size, progress=False)
+    vector = precompute_diffuse(mesh, size=size)
     for bounces in (0, 1, 2, 15):
-        total = interreflect_diffuse(mesh, vector, np.ones((2, 1)), bounces=bounces, size=size, progress=False)
+        total = interreflect_diffuse(mesh, vector, np.ones((2, 1)), bounces=bounces, size=size)
         color = np.asarray(diffuse(total, jnp.ones(1), WHITE))[:, 0]
         assert color.max() < 1 + FURNACE
         if before is not None:
@@ -183,9 +183,9 @@ def test_white_surfaces_in_a_white_furnace_vanish_as_bounces_grow():
 
 def test_a_white_furnace_is_as_white_through_matrices(mesh, matrix, vector):
     white = [tabulate(Lambert([1.0, 1, 1]), resolution=8)] * 2
-    total = interreflect(mesh, matrix, white, bounces=3, size=SIZE, progress=False)
+    total = interreflect(mesh, matrix, white, bounces=3, size=SIZE)
     first, color = (np.asarray(relight(each, white[0], WHITE, eye=EYE))[:, 0] for each in (matrix, total))
-    expected = interreflect_diffuse(mesh, vector, np.ones((2, 1)), bounces=3, size=SIZE, progress=False)
+    expected = interreflect_diffuse(mesh, vector, np.ones((2, 1)), bounces=3, size=SIZE)
     expected = np.asarray(diffuse(expected, jnp.ones(1), WHITE))[:, 0]
     seen = first > 0
     assert seen.sum() > 30
@@ -195,17 +195,17 @@ def test_a_white_furnace_is_as_white_through_matrices(mesh, matrix, vector):
 
 
 def test_no_bounces_change_nothing(mesh, matrix, vector, lambert):
-    same = interreflect_diffuse(mesh, vector, np.ones((2, 1)), bounces=0, size=SIZE, progress=False)
+    same = interreflect_diffuse(mesh, vector, np.ones((2, 1)), bounces=0, size=SIZE)
     np.testing.assert_array_equal(same.vector, vector.vector)
-    same = interreflect(mesh, matrix, lambert, bounces=0, size=SIZE, progress=False)
+    same = interreflect(mesh, matrix, lambert, bounces=0, size=SIZE)
     np.testing.assert_array_equal(same.matrix, np.broadcast_to(matrix.matrix, same.matrix.shape))
 
 
 def test_bounces_add_up(mesh, vector, close):
     """Two bounces are one, and one of what it added."""
-    one, two = (interreflect_diffuse(mesh, vector, ALBEDO, bounces=n, size=SIZE, progress=False).vector for n in (1, 2))
+    one, two = (interreflect_diffuse(mesh, vector, ALBEDO, bounces=n, size=SIZE).vector for n in (1, 2))
     added = TransferVector(one - vector.vector, vector.position)
-    again = interreflect_diffuse(mesh, added, ALBEDO, bounces=1, size=SIZE, progress=False).vector
+    again = interreflect_diffuse(mesh, added, ALBEDO, bounces=1, size=SIZE).vector
     close(two, vector.vector + again)
     assert np.linalg.norm(two - one) > 0.01 * np.linalg.norm(one)
 
@@ -213,7 +213,7 @@ def test_bounces_add_up(mesh, vector, close):
 def test_surfaces_color_each_other_and_not_themselves(mesh, vector):
     """A red sphere over a black ground reddens the ground; the sphere itself gets nothing."""
     albedo = np.array([[1.0, 0, 0], [0, 0, 0]])
-    added = np.asarray(interreflect_diffuse(mesh, vector, albedo, size=SIZE, progress=False).vector - vector.vector)
+    added = np.asarray(interreflect_diffuse(mesh, vector, albedo, size=SIZE).vector - vector.vector)
     color = np.einsum("ilv,i->vl", added, np.asarray(WHITE)[:, 0])
     ball = np.asarray(mesh.region) == 0
     np.testing.assert_array_equal(color[ball], 0)
@@ -228,8 +228,8 @@ def test_surfaces_color_each_other_and_not_themselves(mesh, vector):
 def test_diffuse_matrices_agree_with_vectors(mesh, matrix, vector, lambert):
     light = jnp.asarray(np.random.default_rng(2).normal(size=(25, 3)), jnp.float32)
     light = light.at[9:].multiply(0.3).at[0].set(4)
-    by_matrix = interreflect(mesh, matrix, lambert, bounces=2, size=SIZE, progress=False)
-    by_vector = interreflect_diffuse(mesh, vector, ALBEDO, bounces=2, size=SIZE, progress=False)
+    by_matrix = interreflect(mesh, matrix, lambert, bounces=2, size=SIZE)
+    by_vector = interreflect_diffuse(mesh, vector, ALBEDO, bounces=2, size=SIZE)
     assert by_matrix.matrix.shape[1] == by_vector.vector.shape[1] == 3
     view = np.stack([np.asarray(each.coefficients(jnp.array([[0.0, 0, 1]])))[..., 0] for each in lambert])
     ours = np.einsum("vco,vcoi,ic->vc", view.swapaxes(1, 2)[np.asarray(mesh.region)], by_matrix.matrix, light)
@@ -240,7 +240,7 @@ def test_diffuse_matrices_agree_with_vectors(mesh, matrix, vector, lambert):
 def test_every_region_sends_what_its_own_brdf_reflects(mesh, matrix, lambert):
     gray = HarmonicBrdf(lambert[0].table[:, :1], (), lambert[0].error)
     mixed, only, other = (
-        np.asarray(interreflect(mesh, matrix, brdf, size=SIZE, progress=False).matrix)
+        np.asarray(interreflect(mesh, matrix, brdf, size=SIZE).matrix)
         for brdf in ([gray, lambert[1]], [gray, gray], [lambert[1], lambert[1]])
     )
     ball = np.asarray(mesh.region) == 0
@@ -254,36 +254,36 @@ def test_every_region_sends_what_its_own_brdf_reflects(mesh, matrix, lambert):
 def test_bounces_are_linear_in_the_transport(mesh, vector, close):
     def added(value):
         transport = TransferVector(value, vector.position)
-        return interreflect_diffuse(mesh, transport, ALBEDO, size=SIZE, progress=False).vector - value
+        return interreflect_diffuse(mesh, transport, ALBEDO, size=SIZE).vector - value
 
     other = vector.vector[::-1]
     close(added(2 * vector.vector - other), 2 * added(vector.vector) - added(other))
 
 
 def test_transport_of_some_vertices_is_refused(mesh, matrix, vector, lambert):
-    some = precompute_diffuse(mesh, size=2, vertex=np.arange(5), progress=False)
+    some = precompute_diffuse(mesh, size=2, vertex=np.arange(5))
     with pytest.raises(ValueError, match=r"must have all \d+ vertices of the mesh, got 5"):
-        interreflect_diffuse(mesh, some, ALBEDO, progress=False)
+        interreflect_diffuse(mesh, some, ALBEDO)
     some = eqx.tree_at(lambda t: (t.matrix, t.position), matrix, (matrix.matrix[:5], matrix.position[:5]))
     with pytest.raises(ValueError, match=r"must have all \d+ vertices of the mesh, got 5"):
-        interreflect(mesh, some, lambert, progress=False)
+        interreflect(mesh, some, lambert)
 
 
 def test_regions_without_a_material_are_refused(mesh, matrix, vector, lambert):
     with pytest.raises(ValueError, match="each of the mesh's 2 regions must have a material, got 1"):
-        interreflect_diffuse(mesh, vector, ALBEDO[:1], progress=False)
+        interreflect_diffuse(mesh, vector, ALBEDO[:1])
     for brdf in (lambert[:1], []):
         with pytest.raises(ValueError, match=f"2 regions must have a material, got {len(brdf)}"):
-            interreflect(mesh, matrix, brdf, progress=False)
+            interreflect(mesh, matrix, brdf)
 
 
 def test_tables_of_another_degree_or_with_parameters_are_refused(mesh, matrix, lambert):
     low = lambert[0].truncate(degree=2)
     with pytest.raises(ValueError, match=r"must have the transport's degree 4 and no parameters, got degrees \[2\]"):
-        interreflect(mesh, matrix, [lambert[0], low], progress=False)
+        interreflect(mesh, matrix, [lambert[0], low])
     varying = HarmonicBrdf(jnp.zeros((25, 1, 2, 4, 4)), (jnp.array([0.1, 0.9]),), jnp.zeros(()))
     with pytest.raises(ValueError, match="no parameters"):
-        interreflect(mesh, matrix, [lambert[0], varying], progress=False)
+        interreflect(mesh, matrix, [lambert[0], varying])
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -291,29 +291,29 @@ def test_tables_of_another_degree_or_with_parameters_are_refused(mesh, matrix, l
 def test_bounces_and_sizes_out_of_range_are_refused(mesh, matrix, vector, lambert, options):
     message = "bounces must be a whole number of at least 0" if "bounces" in options else "size a power of two"
     with pytest.raises(ValueError, match=message):
-        interreflect_diffuse(mesh, vector, ALBEDO, progress=False, **options)
+        interreflect_diffuse(mesh, vector, ALBEDO, **options)
     with pytest.raises(ValueError, match=message):
-        interreflect(mesh, matrix, lambert, progress=False, **options)
+        interreflect(mesh, matrix, lambert, **options)
 
 
 @pytest.mark.parametrize("albedo", [np.nan, np.inf])
 def test_albedos_that_are_not_finite_are_refused(mesh, vector, albedo):
     with pytest.raises(ValueError, match="albedos must be finite"):
-        interreflect_diffuse(mesh, vector, np.full((2, 1), albedo), progress=False)
+        interreflect_diffuse(mesh, vector, np.full((2, 1), albedo))
 
 
 def test_bounces_go_on_from_their_folders_which_know_what_they_are_of(mesh, matrix, vector, lambert, tmp_path, close):
-    options = {"bounces": 2, "size": 4, "progress": False}
+    options = {"bounces": 2, "size": 4}
     for number in (1, 2):
-        found = interreflect(mesh, matrix, lambert, path=tmp_path / "matrix", **options).matrix
+        found = interreflect(mesh, matrix, lambert, run=prt.Run(tmp_path / "matrix"), **options).matrix
         shutil.rmtree(tmp_path / "matrix" / "bounce_2")
         if number == 1:
             first = found
     close(found, first)
     albedo = np.array([[0.5], [0.25]])
-    kept = interreflect_diffuse(mesh, vector, albedo, path=tmp_path / "vector", **options).vector
+    kept = interreflect_diffuse(mesh, vector, albedo, run=prt.Run(tmp_path / "vector"), **options).vector
     close(kept, interreflect_diffuse(mesh, vector, albedo, **options).vector)
     with pytest.raises(ValueError, match=r"bounce_1 holds arrays that were computed from other inputs .*brdf"):
-        interreflect(mesh, matrix, lambert[::-1], path=tmp_path / "matrix", **options)
+        interreflect(mesh, matrix, lambert[::-1], run=prt.Run(tmp_path / "matrix"), **options)
     with pytest.raises(ValueError, match=r"bounce_1 holds arrays that were computed from other inputs .*albedo"):
-        interreflect_diffuse(mesh, vector, albedo / 2, path=tmp_path / "vector", **options)
+        interreflect_diffuse(mesh, vector, albedo / 2, run=prt.Run(tmp_path / "vector"), **options)

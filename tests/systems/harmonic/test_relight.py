@@ -46,7 +46,7 @@ def mesh():
 
 @pytest.fixture(scope="module")
 def transport(mesh):
-    return precompute(mesh, size=16, progress=False)
+    return precompute(mesh, size=16)
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +194,7 @@ def test_smooth_light_with_shadows_is_that_of_the_reference(mesh, light, coeffic
 
 
 def test_diffuse_radiance_is_that_of_the_reference(mesh, light, coefficient):
-    vector = harmonic.precompute_diffuse(mesh, size=16, progress=False)
+    vector = harmonic.precompute_diffuse(mesh, size=16)
     albedo = np.random.default_rng(0).uniform(size=(len(mesh.position), 3)).astype(np.float32)
     color = np.asarray(diffuse(vector, jnp.ones(1), coefficient)) * albedo
     above = EYE + 10 * mesh.normal[0]  # Some eye; vertices that it does not see are zero in the reference alone.

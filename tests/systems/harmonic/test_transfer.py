@@ -155,8 +155,8 @@ def test_the_two_sides_of_a_matrix_do_not_mix_frames_and_light(random, close):
 def test_the_vector_is_what_lambert_makes_of_the_matrix(random):
     """Up to what of the cosine the harmonics do not carry."""
     mesh = scene()
-    vector = np.asarray(precompute_diffuse(mesh, size=SIZE, progress=False).vector[:, 0])
-    transport = precompute(mesh, size=SIZE, progress=False)
+    vector = np.asarray(precompute_diffuse(mesh, size=SIZE).vector[:, 0])
+    transport = precompute(mesh, size=SIZE)
     cosine = harmonics.convolve(
         harmonics.evaluate(jnp.array([0.0, 0, 1]), degree=4), harmonics.cosine(degree=4) / jnp.pi
     )
@@ -170,7 +170,7 @@ def test_the_vector_is_what_lambert_makes_of_the_matrix(random):
 
 def test_precomputed_open_vertices_have_the_rotation_to_their_frame(close):
     mesh = builtin.sphere(rings=5, sectors=8)
-    transport = precompute(mesh, degree=3, size=16, progress=False)
+    transport = precompute(mesh, degree=3, size=16)
     close(transport.frame, directions.frame(mesh.normal, mesh.tangent))
     close(transport.matrix[:, 0], open_matrices(transport.frame, 3), tolerance=HORIZON)
     assert transport.nbytes == len(mesh.position) * 16**2 * 4
@@ -179,7 +179,7 @@ def test_precomputed_open_vertices_have_the_rotation_to_their_frame(close):
 def test_a_turned_mesh_has_its_transfer_turned(close):
     quarter = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     mesh = scene()
-    here, there = (precompute(each, degree=2, size=SIZE, progress=False) for each in (mesh, rotate(mesh, quarter)))
+    here, there = (precompute(each, degree=2, size=SIZE) for each in (mesh, rotate(mesh, quarter)))
     turned = rotation.matrix(jnp.asarray(quarter, jnp.float32), degree=2)
     close(there.matrix, here.matrix @ turned.T, tolerance=HORIZON)
 
@@ -187,10 +187,10 @@ def test_a_turned_mesh_has_its_transfer_turned(close):
 @pytest.mark.parametrize("made", [precompute, precompute_diffuse])
 def test_a_stopped_call_goes_on_where_it_was(tmp_path, made):
     mesh = builtin.plane(cells=10)  # 121 vertices: two blocks.
-    options = {"degree": 1, "size": 2, "progress": False, "path": tmp_path / "store"}
+    options = {"degree": 1, "size": 2, "run": prt.Run(tmp_path / "store")}
     field = "matrix" if made is precompute else "vector"
     whole = np.asarray(getattr(made(mesh, **options), field))
-    np.testing.assert_array_equal(whole, getattr(made(mesh, **options | {"path": None}), field))
+    np.testing.assert_array_equal(whole, getattr(made(mesh, **options | {"run": prt.Run()}), field))
     checksum = np.load(tmp_path / "store" / "checksum.npy", mmap_mode="r+")
     both = checksum.tolist()
     assert len(both) == np.count_nonzero(both) == 2
@@ -210,14 +210,14 @@ def test_a_stopped_call_goes_on_where_it_was(tmp_path, made):
 @pytest.mark.parametrize("made", [precompute, precompute_diffuse])
 def test_any_selection_of_vertices_in_any_order(made):
     mesh, vertex = builtin.sphere(rings=6, sectors=9), np.array([11, 3, 3, 40])
-    whole, some = (made(mesh, degree=1, size=4, vertex=each, progress=False) for each in (None, vertex))
+    whole, some = (made(mesh, degree=1, size=4, vertex=each) for each in (None, vertex))
     if made is precompute:
         np.testing.assert_array_equal(some.matrix, whole.matrix[vertex])
         np.testing.assert_array_equal(some.frame, whole.frame[vertex])
     else:
         np.testing.assert_array_equal(some.vector, whole.vector[..., vertex])
     np.testing.assert_array_equal(some.position, mesh.position[vertex])
-    none = made(mesh, degree=1, size=4, vertex=np.zeros(0, int), progress=False)
+    none = made(mesh, degree=1, size=4, vertex=np.zeros(0, int))
     assert none.nbytes == 0
 
 
@@ -225,7 +225,7 @@ def test_any_selection_of_vertices_in_any_order(made):
 @pytest.mark.parametrize("options", [{"degree": -1}, {"degree": 26}, {"size": 0}, {"size": 12}])
 def test_degrees_and_sizes_out_of_range_are_refused(made, options):
     with pytest.raises(ValueError, match="degree must be 0 to 25 and size a power of two, got"):
-        made(builtin.plane(cells=1), progress=False, **options)
+        made(builtin.plane(cells=1), **options)
 
 
 def test_positions_that_are_not_finite_are_refused():
@@ -236,7 +236,7 @@ def test_positions_that_are_not_finite_are_refused():
     )  # fmt: skip
     for made in (precompute, precompute_diffuse):
         with pytest.raises(ValueError, match="finite"):
-            made(broken, degree=1, size=2, progress=False)
+            made(broken, degree=1, size=2)
 
 
 @pytest.mark.parametrize("count", [0, 5, 24 + 6, 6 * 9])

@@ -13,6 +13,7 @@ from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.scene.points import on_triangles
 from jaxprt.sphere import directions
 from jaxprt.systems.protocol import Blend
+from jaxprt.visibility import Run
 
 HEIGHT, SIDE = 0.8, 0.3
 SAMPLED = 0.01  # what 256 points on a lamp leave of its irradiance, relative to the norm
@@ -41,7 +42,7 @@ BULB = PointLight("bulb", [0.2, 0.5, -0.3], 2.0)
 
 @pytest.fixture(scope="module")
 def transport() -> lamps.LampTransport:
-    return lamps.precompute(GROUND, [LAMP, BULB], occluder=join([GROUND, LAMP]), progress=False)
+    return lamps.precompute(GROUND, [LAMP, BULB], occluder=join([GROUND, LAMP]))
 
 
 def irradiance(point: np.ndarray) -> float:
@@ -80,7 +81,7 @@ def test_the_irradiance_of_a_square_is_lamberts_formula(transport):
 def test_near_lamps_are_lamberts_formula_too():
     """A thirtieth of the lamp's width above the middle of the ground, where 256 points are too few."""
     close_by = square([0.0, 0.02, 0.0], SIDE, down=True)
-    near = lamps.precompute(floor(5), [close_by], occluder=join([floor(5), close_by]), progress=False)
+    near = lamps.precompute(floor(5), [close_by], occluder=join([floor(5), close_by]))
     middle = int(np.argmin(np.abs(np.asarray(near.position)).sum(1)))
     corner = np.asarray(close_by.position, np.float64)
     unit = corner / np.linalg.norm(corner, axis=1, keepdims=True)
@@ -100,7 +101,7 @@ def test_a_point_light_falls_with_the_square_of_the_distance(transport, close):
 def test_a_spot_lights_its_cone(transport):
     axis, inner, outer = np.array([0.3, -1.0, 0.2]), 0.4, 1.0
     spot = PointLight("spot", BULB.position, 2.0, axis=axis, cone=(inner, outer))
-    lit = lamps.precompute(GROUND, [LAMP, spot], occluder=join([GROUND, LAMP]), progress=False)
+    lit = lamps.precompute(GROUND, [LAMP, spot], occluder=join([GROUND, LAMP]))
     way = np.asarray(GROUND.position, np.float64) - np.asarray(BULB.position)
     angle = np.arccos(way @ axis / np.linalg.norm(way, axis=1) / np.linalg.norm(axis))
     # KHR_lights_punctual, "Inner and Outer Cone Angles".
@@ -117,13 +118,13 @@ def test_a_spot_lights_its_cone(transport):
 
 def test_what_stands_between_casts_a_shadow_and_backs_send_nothing():
     wall = square([0, HEIGHT / 2, 0], 3.0, down=True)
-    dark = lamps.precompute(GROUND, [LAMP, BULB], occluder=join([GROUND, LAMP, wall]), samples=16, progress=False)
+    dark = lamps.precompute(GROUND, [LAMP, BULB], occluder=join([GROUND, LAMP, wall]), samples=16)
     assert not np.any(dark.solid_angle)
     turned = square([0, HEIGHT, 0], SIDE, down=False)
-    away = lamps.precompute(GROUND, [turned], occluder=join([GROUND, turned]), samples=16, progress=False)
+    away = lamps.precompute(GROUND, [turned], occluder=join([GROUND, turned]), samples=16)
     assert not np.any(away.solid_angle)
     below = PointLight("below", [0.0, -1.0, 0.0], 1.0)
-    assert not np.any(lamps.precompute(GROUND, [below], progress=False).solid_angle)
+    assert not np.any(lamps.precompute(GROUND, [below]).solid_angle)
 
 
 def test_half_a_lamp_behind_an_edge_sends_half_its_light():
@@ -132,7 +133,7 @@ def test_half_a_lamp_behind_an_edge_sends_half_its_light():
     corner = np.array([[0.0, high, -3], [3.0, high, -3], [3.0, high, 3], [0.0, high, 3]])
     screen = make_mesh(corner, np.array([[0, 1, 2], [0, 2, 3]]), normal=np.tile([0.0, 1.0, 0.0], (4, 1)))
     ground = floor(5)
-    options = {"samples": 256, "pieces": 1, "progress": False}
+    options = {"samples": 256, "pieces": 1}
     whole = lamps.precompute(ground, [LAMP], occluder=join([ground, LAMP]), **options)
     half = lamps.precompute(ground, [LAMP], occluder=join([ground, LAMP, screen]), **options)
     middle = np.abs(np.asarray(ground.position)[:, 0]) < 1e-6
@@ -159,7 +160,7 @@ def test_lobes_over_disks_are_normal_distributions_over_disks(chord):
 def test_highlights_of_lamps_are_integrals_over_the_lamp(close):
     """Of what the table of lobes says of the BRDF, so that its own error has no part."""
     eye = jnp.array([0.4, 0.8, 0.6])  # sees the lamp mirrored around a vertex
-    options = {"pieces": 16, "occluder": join([GROUND, LAMP]), "progress": False}
+    options = {"pieces": 16, "occluder": join([GROUND, LAMP])}
     fine = lamps.precompute(GROUND, [LAMP, BULB], **options)
     for roughness in (0.3, 0.5):
         table = lobe.tabulate(GGX(f0=0.9, roughness=roughness), lobes=4, resolution=12)
@@ -204,7 +205,7 @@ def test_points_on_vertices_are_these_vertices_and_matte_ones_do_not_depend_on_t
 
 
 def test_stores_go_on_and_are_of_their_lamps(tmp_path):
-    options = {"samples": 8, "pieces": 2, "path": tmp_path / "lamps.prt", "progress": False}
+    options = {"samples": 8, "pieces": 2, "run": Run(tmp_path / "lamps.prt")}
     once, again = (lamps.precompute(GROUND, [LAMP], **options) for _ in range(2))
     np.testing.assert_array_equal(once.cosine, again.cosine)
     with pytest.raises(ValueError, match="lamps"):
@@ -220,7 +221,7 @@ def test_bad_lamps_are_refused(unchecked):
         ({"lamps": [LAMP], "samples": 2}, "at most the 2 samples, got 4"),
     ):
         with pytest.raises(ValueError, match=message):
-            lamps.precompute(GROUND, **given, progress=False)
+            lamps.precompute(GROUND, **given)
     with pytest.raises(TypeError, match="lamp 0 must be"):
         lamps.precompute(GROUND, ["lamp"])
     with pytest.raises(ValueError, match="intensity of point light 'dark' must be at least 0"):

@@ -20,7 +20,7 @@ COLORS = 3
 @pytest.fixture(scope="module")
 def visible():
     ball = builtin.sphere(rings=8, sectors=10)
-    return visibility.precompute(join([ball, ground_plane(ball, vertices=36)]), size=SIZE, progress=False)
+    return visibility.precompute(join([ball, ground_plane(ball, vertices=36)]), size=SIZE)
 
 
 @pytest.fixture(scope="module")

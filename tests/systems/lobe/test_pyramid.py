@@ -11,6 +11,7 @@ from jaxprt.decompose import mixture
 from jaxprt.scene import builtin
 from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.sphere import cubemap
+from jaxprt.visibility import Run
 
 SIZE = 16
 BYTE = 2e-3  # half a step of a byte
@@ -23,7 +24,7 @@ FRACTION = 0.06
 def visible():
     """A ball over the ground: vertices with contact shadows, and ground vertices near them."""
     ball = builtin.sphere(rings=8, sectors=10)
-    return visibility.precompute(join([ball, ground_plane(ball, vertices=36)]), size=SIZE, progress=False)
+    return visibility.precompute(join([ball, ground_plane(ball, vertices=36)]), size=SIZE)
 
 
 @pytest.fixture(scope="module")
@@ -177,8 +178,8 @@ def test_tracing_gives_what_compressing_known_visibility_gives(visible, compress
     ball = builtin.sphere(rings=8, sectors=10)
     scene = join([ball, ground_plane(ball, vertices=36)])
     chosen = np.arange(0, len(scene.position), 7)
-    traced = lobe.precompute(scene, size=SIZE, vertex=chosen, path=tmp_path / "a.prt", progress=False)
-    again = lobe.precompute(scene, size=SIZE, vertex=chosen, path=tmp_path / "a.prt", progress=False)
+    traced = lobe.precompute(scene, size=SIZE, vertex=chosen, run=Run(tmp_path / "a.prt"))
+    again = lobe.precompute(scene, size=SIZE, vertex=chosen, run=Run(tmp_path / "a.prt"))
     # Known visibility is in four bits, in which 9 sixteenths are 8.
     assert np.mean(np.asarray(traced.pyramid) != np.asarray(compressed.pyramid)[chosen]) < 0.05
     assert (

@@ -40,7 +40,7 @@ def seen_from(depth):
     ball = builtin.sphere(rings=8, sectors=10)
     ground = ground_plane(ball, vertices=36)
     below = eqx.tree_at(lambda mesh: mesh.position, ground, ground.position - jnp.array([0, depth, 0]))
-    return visibility.precompute(join([ball, below]), size=SIZE, progress=False)
+    return visibility.precompute(join([ball, below]), size=SIZE)
 
 
 @pytest.fixture(scope="module")

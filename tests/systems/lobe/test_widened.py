@@ -31,7 +31,7 @@ def mesh():
 
 @pytest.fixture(scope="module")
 def seen(mesh):
-    return visibility.precompute(mesh, size=SIZE, progress=False)
+    return visibility.precompute(mesh, size=SIZE)
 
 
 @pytest.fixture(scope="module")

@@ -47,7 +47,7 @@ def mesh():
 
 @pytest.fixture(scope="module")
 def seen(mesh):
-    return visibility.precompute(mesh, size=SIZE, progress=False)
+    return visibility.precompute(mesh, size=SIZE)
 
 
 @pytest.fixture(scope="module")
@@ -65,12 +65,12 @@ def exact(seen, brdf):
 @pytest.fixture(scope="module")
 def whole(seen, brdf):
     """All components, modes and coefficients."""
-    return precompute(seen, brdf, progress=False, **WHOLE)
+    return precompute(seen, brdf, **WHOLE)
 
 
 @pytest.fixture(scope="module")
 def small(seen, brdf):
-    return precompute(seen, brdf, progress=False, **SMALL)
+    return precompute(seen, brdf, **SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -264,7 +264,7 @@ def test_numbering_the_vertices_anew_numbers_the_radiance(whole, mesh, brdf, ran
     number = np.argsort(order)
     shuffled = jax.tree.map(lambda each: each[order] if len(each) == VERTICES else each, mesh)
     shuffled = eqx.tree_at(lambda m: m.face, shuffled, jnp.asarray(number[np.asarray(mesh.face)], jnp.int32))
-    again = precompute(visibility.precompute(shuffled, size=SIZE, progress=False), brdf, progress=False, **WHOLE)
+    again = precompute(visibility.precompute(shuffled, size=SIZE), brdf, **WHOLE)
     expected = relight(whole, brdf, light)[order]
     close(relight(again, brdf, light), expected, tolerance=2 * HALF)
 
@@ -288,9 +288,9 @@ def test_flat_and_coincident_vertices_are_clustered(random):
 def test_clusters_may_be_named(seen, brdf, whole, close):
     member = np.asarray(whole.vertex).reshape(CLUSTERS, -1)
     options = {name: value for name, value in WHOLE.items() if name != "clusters"}
-    same(precompute(seen, brdf, member=member, progress=False, **options), whole)
+    same(precompute(seen, brdf, member=member, **options), whole)
     mixed = np.concatenate([np.arange(VERTICES), [0]]).reshape(-1, 4).T
-    other = precompute(seen, brdf, member=mixed, progress=False, **options)
+    other = precompute(seen, brdf, member=mixed, **options)
     close(by_vertex(other), by_vertex(whole), tolerance=2 * HALF)
 
 
@@ -300,21 +300,21 @@ def test_workers_of_any_kind_give_the_same_bits_and_a_store_is_resumed(seen, brd
         for block in lost:
             np.load(path / "checksum.npy", mmap_mode="r+")[block] = 0
         executor = Strangers()
-        same(precompute(seen, brdf, path=path, executor=executor, progress=False, **SMALL), small)
+        same(precompute(seen, brdf, run=prt.Run(path, executor), **SMALL), small)
         assert executor.count == count
 
 
 def test_float64_workers_give_the_same_and_their_store_is_resumed(seen, brdf, small, tmp_path, close, x64):
     for count in (CLUSTERS, 0):
         executor = Strangers()
-        found = precompute(seen, brdf, path=tmp_path / "a.prt", executor=executor, progress=False, **SMALL)
+        found = precompute(seen, brdf, run=prt.Run(tmp_path / "a.prt", executor), **SMALL)
         assert executor.count == count
         close(dense(found), dense(small), tolerance=HALF)
 
 
 def test_a_store_made_from_something_else_is_refused(seen, brdf, small, tmp_path):
     path = tmp_path / "a.prt"
-    precompute(seen, brdf, path=path, progress=False, **SMALL)
+    precompute(seen, brdf, run=prt.Run(path), **SMALL)
     darker = eqx.tree_at(lambda t: t.level, seen, seen.level.at[0, 5, 7].set(0x11))
     other = eqx.tree_at(lambda b: b.light_map, brdf, 2 * brdf.light_map)
     for transport, factored, options in (
@@ -325,7 +325,7 @@ def test_a_store_made_from_something_else_is_refused(seen, brdf, small, tmp_path
         (seen, brdf, SMALL | {"clusters": 5}),
     ):
         with pytest.raises(ValueError, match=r"a\.prt holds arrays that were computed from other inputs"):
-            precompute(transport, factored, path=path, progress=False, **options)
+            precompute(transport, factored, run=prt.Run(path), **options)
 
 
 @pytest.mark.parametrize(
@@ -350,7 +350,7 @@ def test_a_store_made_from_something_else_is_refused(seen, brdf, small, tmp_path
 )
 def test_impossible_numbers_are_refused(seen, brdf, options, message):
     with pytest.raises(ValueError, match=message):
-        precompute(seen, brdf, progress=False, **WHOLE | options)
+        precompute(seen, brdf, **WHOLE | options)
 
 
 @pytest.mark.parametrize(("name", "limit"), [("count", 100), ("modes", 8), ("components", 4), ("terms", 3)], ids=str)
@@ -363,10 +363,10 @@ def test_keeping_more_than_there_are_is_refused(small, name, limit):
 @pytest.mark.usefixtures("unchecked")
 def test_brdfs_without_shared_light_maps_are_refused(seen):
     with pytest.raises(TypeError, match=r"must be factored, by jaxprt.separable.factor, got Lambert"):
-        precompute(seen, Lambert(0.5), progress=False, **SMALL)
+        precompute(seen, Lambert(0.5), **SMALL)
     colored = SeparableBrdf(jnp.ones((3, 4, 4, 3)), jnp.ones((3, 4, 4, 3)), jnp.zeros(()))
     with pytest.raises(ValueError, match="light maps must have one channel that all colors share, got 3 channels"):
-        precompute(seen, colored, progress=False, **SMALL)
+        precompute(seen, colored, **SMALL)
 
 
 def test_other_brdfs_and_lights_than_it_was_made_for_are_refused(small, brdf):
@@ -398,12 +398,12 @@ def test_tuples_are_combined_color_by_color(random, close, colors):
 def test_stores_open_with_visibility_and_factors_that_differ_by_rounding_and_refuse_others(
     seen, brdf, tmp_path, monkeypatch
 ):
-    path, options = tmp_path / "a.prt", {"progress": False, **SMALL}
-    first = precompute(seen, brdf, path=path, **options)
+    path, options = tmp_path / "a.prt", SMALL
+    first = precompute(seen, brdf, run=prt.Run(path), **options)
     monkeypatch.setattr(separable.clustered, "compress", None)  # Nothing is computed again.
     rounded = eqx.tree_at(lambda x: x.frame, seen, jnp.nextafter(seen.frame, jnp.inf))
     factors = eqx.tree_at(lambda x: x.light_map, brdf, jnp.nextafter(brdf.light_map, jnp.inf))
-    again = precompute(rounded, factors, path=path, **options)
+    again = precompute(rounded, factors, run=prt.Run(path), **options)
     np.testing.assert_array_equal(again.core, first.core)
     darker = eqx.tree_at(lambda x: x.light_map, brdf, 0.99 * brdf.light_map)
     turned = eqx.tree_at(lambda x: x.light_map, brdf, brdf.light_map.at[-1].multiply(-1))
@@ -418,7 +418,7 @@ def test_stores_open_with_visibility_and_factors_that_differ_by_rounding_and_ref
         with pytest.raises(
             ValueError, match=rf"a\.prt holds arrays that were computed from other inputs \({name}: stored"
         ):
-            precompute(*what, path=path, **options)
+            precompute(*what, run=prt.Run(path), **options)
 
 
 def test_fewer_terms_know_their_brdf_and_refuse_others(seen, brdf, small):
@@ -433,8 +433,8 @@ def test_fewer_terms_know_their_brdf_and_refuse_others(seen, brdf, small):
 
 def test_clusters_grow_with_the_root_of_the_vertices_and_sizes_fit_any_mesh(brdf):
     assert [members.clusters_for(count) for count in (1, 3, 100, 36_000, 1_000_000)] == [1, 1, 8, 159, 840]
-    triangle = visibility.precompute(builtin.plane(cells=1), size=2, progress=False)
-    few = precompute(triangle, brdf, progress=False)
+    triangle = visibility.precompute(builtin.plane(cells=1), size=2)
+    few = precompute(triangle, brdf)
     assert (few.core.shape[2], few.index.shape) == (2, (2, 24))
     light = builtin.daylight(size=2)
     exact = project(jnp.asarray(triangle.seen(np.arange(4))), triangle.frame, brdf)[..., 0]
@@ -444,13 +444,13 @@ def test_clusters_grow_with_the_root_of_the_vertices_and_sizes_fit_any_mesh(brdf
 
 def test_jobs_send_mapped_visibility_by_the_name_of_its_file(brdf, tmp_path):
     mesh = builtin.sphere(rings=12, sectors=14)
-    mapped = visibility.precompute(mesh, size=8, path=tmp_path / "a.prt", progress=False)
-    held, jobs = visibility.precompute(mesh, size=8, progress=False), []
+    mapped = visibility.precompute(mesh, size=8, run=prt.Run(tmp_path / "a.prt"))
+    held, jobs = visibility.precompute(mesh, size=8), []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(visibility.blocks, "compute", lambda job, **_: jobs.append(job) or {}["stop"])
+        patch.setattr(visibility.blocks, "compute", lambda job, *_, **__: jobs.append(job) or {}["stop"])
         for seen in (mapped, held):
             with pytest.raises(KeyError):
-                precompute(seen, brdf, keep=9, progress=False)
+                precompute(seen, brdf, keep=9)
     sent = [pickle.dumps(job) for job in jobs]
     assert len(sent[0]) < len(sent[1]) - mapped.nbytes + 1000
     for there in map(pickle.loads, sent):

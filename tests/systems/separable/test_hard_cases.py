@@ -58,7 +58,7 @@ def repeated(mesh, vertex):
 def relight(mesh, brdf, light, *, keep=24, eye=EYE, vertex=None):
     """Radiance, checked to be finite."""
     count, vertex = repeated(mesh, vertex)
-    transport = precompute(mesh, brdf, keep=keep, size=SIZE, vertex=vertex, progress=False)
+    transport = precompute(mesh, brdf, keep=keep, size=SIZE, vertex=vertex)
     color = np.asarray(prt.radiance(separable.SeparableSystem(transport, brdf), light, eye=eye))
     assert color.shape == (len(vertex), 3)
     assert np.isfinite(color).all()
@@ -172,7 +172,7 @@ def test_what_touches_the_ground_is_not_lit_from_beneath(lambert):
 @pytest.fixture(scope="module")
 def seen():
     """Visibility from the 38 vertices of a sphere that lies on a ground."""
-    return see(join([moved(sphere(), shift=[0, 1, 0]), builtin.plane(cells=1)]), size=SIZE, progress=False)
+    return see(join([moved(sphere(), shift=[0, 1, 0]), builtin.plane(cells=1)]), size=SIZE)
 
 
 # Two clusters of ten vertices, two of nine. All is kept, so that what is left is the rounding of half precision.
@@ -182,7 +182,7 @@ HALF = 2e-3
 
 def clustered_radiance(seen, brdf, light, **options):
     """Radiance by clustered transport, every number of which is checked to be finite."""
-    transport = separable.clustered.precompute(seen, brdf, progress=False, **KEPT | options)
+    transport = separable.clustered.precompute(seen, brdf, **KEPT | options)
     for name in ("mode", "core", "weight", "rms"):
         assert np.isfinite(np.asarray(getattr(transport, name), np.float64)).all(), name
     color = np.asarray(prt.radiance(separable.SeparableSystem(transport, brdf), light, eye=EYE))

@@ -144,7 +144,7 @@ def test_a_quarter_turn_of_everything_changes_nothing(brdf, random, close):
 
     def of(mesh, light, eye):
         # All coefficients: wavelets of a turned face are other wavelets, their span is the same.
-        transport = precompute(mesh, factored, keep=6 * SIZE**2, size=SIZE, progress=False)
+        transport = precompute(mesh, factored, keep=6 * SIZE**2, size=SIZE)
         return relight(transport, factored, light, eye=eye)
 
     turned = eqx.tree_at(

@@ -140,9 +140,9 @@ def test_kept_coefficients_are_the_best_approximation_of_their_number(random, fa
 
 def test_precomputed_vertices_may_be_any_selection_in_any_order(factored):
     mesh = prt.scene.builtin.sphere(rings=6, sectors=9)
-    whole = precompute(mesh, factored, keep=9, size=4, progress=False)
+    whole = precompute(mesh, factored, keep=9, size=4)
     vertex = np.array([11, 3, 3, 40])
-    some = precompute(mesh, factored, keep=9, size=4, vertex=vertex, progress=False)
+    some = precompute(mesh, factored, keep=9, size=4, vertex=vertex)
     for field, axis in (("index", 1), ("value", 1), ("position", 0), ("frame", 0)):
         expected = np.take(np.asarray(getattr(whole, field)), vertex, axis)
         np.testing.assert_array_equal(getattr(some, field), expected)
@@ -159,13 +159,13 @@ def test_precomputed_vertices_may_be_any_selection_in_any_order(factored):
 )
 def test_impossible_sizes_are_refused(factored, options, message):
     with pytest.raises(ValueError, match=message):
-        precompute(prt.scene.builtin.plane(cells=1), factored, progress=False, **options)
+        precompute(prt.scene.builtin.plane(cells=1), factored, **options)
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_a_brdf_that_is_not_factored_is_refused():
     with pytest.raises(TypeError, match=r"must be factored, by jaxprt.separable.factor, got Lambert"):
-        precompute(prt.scene.builtin.plane(cells=1), prt.brdf.Lambert(0.5), keep=4, size=2, progress=False)
+        precompute(prt.scene.builtin.plane(cells=1), prt.brdf.Lambert(0.5), keep=4, size=2)
 
 
 @pytest.mark.parametrize("field", ["position", "normal", "tangent"])
@@ -178,18 +178,18 @@ def test_values_that_are_not_finite_are_refused(factored, field):
         }
     )
     with pytest.raises(ValueError, match="finite"):
-        precompute(broken, factored, keep=4, size=2, progress=False)
+        precompute(broken, factored, keep=4, size=2)
 
 
 @pytest.mark.parametrize("vertex", [4, -5])
 def test_vertices_that_are_not_there_are_refused(factored, vertex):
     mesh = prt.scene.builtin.plane(cells=1)
     with pytest.raises(ValueError, match=rf"array of indices below 4, got int64 \(2,\): \[ ?0 +{vertex}\]"):
-        precompute(mesh, factored, keep=4, size=2, vertex=np.array([0, vertex]), progress=False)
+        precompute(mesh, factored, keep=4, size=2, vertex=np.array([0, vertex]))
 
 
 def test_no_vertices_have_no_transport(factored):
     mesh = prt.scene.builtin.plane(cells=1)
-    transport = precompute(mesh, factored, keep=4, size=2, vertex=np.zeros(0, int), progress=False)
+    transport = precompute(mesh, factored, keep=4, size=2, vertex=np.zeros(0, int))
     assert transport.value.shape == (4, 0, 3, 1)
     np.testing.assert_array_equal(transport.rms, 0)
