@@ -131,31 +131,6 @@ def test_a_store_is_resumed_and_only_what_is_missing_is_traced(mesh, tmp_path):
             assert executor.count == count
 
 
-def test_a_store_made_from_something_else_is_refused(mesh, tmp_path):
-    path = tmp_path / "a.prt"
-    precompute(mesh, size=SIZE, run=Run(path))
-    for other, options in (
-        (mesh, {"size": SIZE // 2}),
-        (mesh, {"size": SIZE, "vertex": np.arange(38)}),
-        (mesh, {"size": SIZE, "occluder": builtin.plane(cells=1)}),
-        (builtin.plane(cells=6), {"size": SIZE}),
-    ):
-        with pytest.raises(ValueError, match=r"a\.prt holds arrays that were computed from other inputs"):
-            precompute(other, run=Run(path), **options)
-
-
-@pytest.mark.parametrize("size", [0, -8, 12])
-def test_sizes_that_are_no_powers_of_two_are_refused(mesh, size):
-    with pytest.raises(ValueError, match=f"size must be a power of two, got {size}"):
-        precompute(mesh, size=size)
-
-
-def test_vertices_that_are_not_there_are_refused(mesh):
-    for vertex in (np.array([39]), np.array([0.5]), np.ones(38, bool)):
-        with pytest.raises(ValueError, match=r"vertex must be a mask \[39\] or a 1-D array of indices below 39"):
-            precompute(mesh, size=SIZE, vertex=vertex)
-
-
 def test_it_is_a_pytree_whose_leaves_are_its_arrays(transport):
     leaves, form = jax.tree.flatten(transport)
     assert len(leaves) == 3

@@ -1,6 +1,5 @@
 """Relighting by harmonics: all ways to the same radiance, closed forms without shadows, probes, and the reference."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -143,37 +142,6 @@ def test_unshadowed_radiance_is_the_integral_of_light_times_table(random):
         value = brdf(local, jnp.broadcast_to(wo[vertex], local.shape))
         expected = (np.repeat(weight, 9) * 2 * np.pi / 9) @ (arriving * value)
         np.testing.assert_allclose(color[vertex], expected, atol=1e-4)
-
-
-def test_one_light_for_all_is_the_same_light_at_each_vertex(random, close):
-    matrix, brdf = made(random)
-    mesh = make_mesh(matrix.position, np.array([[0, 1, 2]]), normal=matrix.frame[:, 2], tangent=matrix.frame[:, 0])
-    light = normal(random, 9, 3)
-    each = jnp.broadcast_to(light[..., None], (9, 3, 5))
-    for made_of, way in ((matrix, relight), (mesh, unshadowed_radiance)):
-        close(way(made_of, brdf, each, eye=EYE), way(made_of, brdf, light, eye=EYE))
-
-
-def test_each_vertex_meets_its_own_light(random, close):
-    matrix, brdf = made(random)
-    light = normal(random, 9, 3, 5)
-    actual = relight(matrix, brdf, light, eye=EYE)
-    for vertex in range(5):
-        close(actual[vertex], relight(matrix, brdf, light[..., vertex], eye=EYE)[vertex])
-
-
-def test_gray_is_three_equal_colors(random, close):
-    matrix, brdf = made(random, colors=1)
-    light = normal(random, 9, 1)
-    gray = relight(matrix, brdf, light, eye=EYE)
-    assert gray.shape == (5, 1)
-    colored = eqx.tree_at(lambda b: b.table, brdf, jnp.repeat(brdf.table, 3, 1))
-    thrice = eqx.tree_at(lambda m: m.matrix, matrix, jnp.repeat(matrix.matrix, 3, 1))
-    for one in (matrix, thrice):
-        for table in (brdf, colored):
-            for shine in (light, jnp.repeat(light, 3, 1)):
-                actual = relight(one, table, shine, eye=EYE)
-                close(actual, jnp.repeat(gray, actual.shape[1], 1))
 
 
 def test_smooth_light_without_shadows_is_that_of_the_reference(light, coefficient, glossy):

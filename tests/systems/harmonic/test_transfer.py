@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import jaxprt as prt
 from jaxprt.scene import builtin
 from jaxprt.scene.mesh import join, make_mesh, rotate
 from jaxprt.sphere import cubemap, directions, harmonics, rotation
@@ -185,58 +184,10 @@ def test_a_turned_mesh_has_its_transfer_turned(close):
 
 
 @pytest.mark.parametrize("made", [precompute, precompute_diffuse])
-def test_a_stopped_call_goes_on_where_it_was(tmp_path, made):
-    mesh = builtin.plane(cells=10)  # 121 vertices: two blocks.
-    options = {"degree": 1, "size": 2, "run": prt.Run(tmp_path / "store")}
-    field = "matrix" if made is precompute else "vector"
-    whole = np.asarray(getattr(made(mesh, **options), field))
-    np.testing.assert_array_equal(whole, getattr(made(mesh, **options | {"run": prt.Run()}), field))
-    checksum = np.load(tmp_path / "store" / "checksum.npy", mmap_mode="r+")
-    both = checksum.tolist()
-    assert len(both) == np.count_nonzero(both) == 2
-    checksum[1] = 0
-    np.testing.assert_array_equal(getattr(made(mesh, **options), field), whole)
-    assert checksum.tolist() == both
-    for change in ({"degree": 2}, {"size": 4}):
-        with pytest.raises(ValueError, match="computed from other inputs"):
-            made(mesh, **options | change)
-    with pytest.raises(ValueError, match="computed from other inputs"):
-        made(builtin.sphere(rings=5, sectors=8), **options)
-    other = precompute_diffuse if made is precompute else precompute
-    with pytest.raises(ValueError, match="computed from other inputs"):
-        other(mesh, **options)
-
-
-@pytest.mark.parametrize("made", [precompute, precompute_diffuse])
-def test_any_selection_of_vertices_in_any_order(made):
-    mesh, vertex = builtin.sphere(rings=6, sectors=9), np.array([11, 3, 3, 40])
-    whole, some = (made(mesh, degree=1, size=4, vertex=each) for each in (None, vertex))
-    if made is precompute:
-        np.testing.assert_array_equal(some.matrix, whole.matrix[vertex])
-        np.testing.assert_array_equal(some.frame, whole.frame[vertex])
-    else:
-        np.testing.assert_array_equal(some.vector, whole.vector[..., vertex])
-    np.testing.assert_array_equal(some.position, mesh.position[vertex])
-    none = made(mesh, degree=1, size=4, vertex=np.zeros(0, int))
-    assert none.nbytes == 0
-
-
-@pytest.mark.parametrize("made", [precompute, precompute_diffuse])
 @pytest.mark.parametrize("options", [{"degree": -1}, {"degree": 26}, {"size": 0}, {"size": 12}])
 def test_degrees_and_sizes_out_of_range_are_refused(made, options):
     with pytest.raises(ValueError, match="degree must be 0 to 25 and size a power of two, got"):
         made(builtin.plane(cells=1), **options)
-
-
-def test_positions_that_are_not_finite_are_refused():
-    mesh = builtin.plane(cells=1)
-    broken = prt.scene.Mesh(
-        **{name: getattr(mesh, name).at[1, 0].set(jnp.nan) if name == "position" else getattr(mesh, name)
-           for name in vars(mesh)}
-    )  # fmt: skip
-    for made in (precompute, precompute_diffuse):
-        with pytest.raises(ValueError, match="finite"):
-            made(broken, degree=1, size=2)
 
 
 @pytest.mark.parametrize("count", [0, 5, 24 + 6, 6 * 9])

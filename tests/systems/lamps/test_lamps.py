@@ -13,7 +13,6 @@ from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.scene.points import on_triangles
 from jaxprt.sphere import directions
 from jaxprt.systems.protocol import Blend
-from jaxprt.visibility import Run
 
 HEIGHT, SIDE = 0.8, 0.3
 SAMPLED = 0.01  # what 256 points on a lamp leave of its irradiance, relative to the norm
@@ -202,14 +201,6 @@ def test_points_on_vertices_are_these_vertices_and_matte_ones_do_not_depend_on_t
     close(
         np.asarray(lamps.LitByLamps(transport, albedo=[0.5]).view(eye))[..., 0] * 2, np.asarray(lit.view(eye))[..., 0]
     )
-
-
-def test_stores_go_on_and_are_of_their_lamps(tmp_path):
-    options = {"samples": 8, "pieces": 2, "run": Run(tmp_path / "lamps.prt")}
-    once, again = (lamps.precompute(GROUND, [LAMP], **options) for _ in range(2))
-    np.testing.assert_array_equal(once.cosine, again.cosine)
-    with pytest.raises(ValueError, match="lamps"):
-        lamps.precompute(GROUND, [square([0, 2 * HEIGHT, 0], SIDE, down=True)], **options)
 
 
 def test_bad_lamps_are_refused(unchecked):

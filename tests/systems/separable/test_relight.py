@@ -18,7 +18,6 @@ from jaxprt.systems.separable.sparse import compress
 SIZE = 8
 EYE = jnp.array([2.0, 3.0, 4.0])
 TURNED = 1e-4  # Rays along rotated directions meet edges on either side by rounding.
-RIM = 1e-4  # A texel's center may lie below the horizon where its mean direction does not: .00002 in all.
 COLORED = AshikhminShirley(diffuse=[0.6, 0.2, 0.1], specular=[0.2, 0.3, 0.7], nu=20, nv=60)
 
 
@@ -114,12 +113,6 @@ def test_projection_keeps_energy_and_transforms_each_face_by_itself(random, clos
     face = np.asarray(separable.system.project(Environment(array(only)))).reshape(6, -1, 3)
     close(face[3], coefficient.reshape(6, -1, 3)[3])
     assert not np.delete(face, 3, axis=0).any()
-
-
-def test_lights_of_another_size_are_refused(transport, factored):
-    message = r"the light must be one environment \[6, 8, 8, c\], got \[6, 4, 4, 3\]"
-    with pytest.raises(ValueError, match=message):
-        relight(transport, factored, white_light(6, 4, 4, 3))
 
 
 @pytest.mark.usefixtures("unchecked")

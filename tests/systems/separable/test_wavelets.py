@@ -138,21 +138,9 @@ def test_kept_coefficients_are_the_best_approximation_of_their_number(random, fa
     assert index.shape == (50, 3, 3)
 
 
-def test_precomputed_vertices_may_be_any_selection_in_any_order(factored):
-    mesh = prt.scene.builtin.sphere(rings=6, sectors=9)
-    whole = precompute(mesh, factored, keep=9, size=4)
-    vertex = np.array([11, 3, 3, 40])
-    some = precompute(mesh, factored, keep=9, size=4, vertex=vertex)
-    for field, axis in (("index", 1), ("value", 1), ("position", 0), ("frame", 0)):
-        expected = np.take(np.asarray(getattr(whole, field)), vertex, axis)
-        np.testing.assert_array_equal(getattr(some, field), expected)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"size": 12}, "size must be a power of two, got 12"),
-        ({"size": 0}, "size must be a power of two, got 0"),
         ({"size": 2, "keep": 25}, "keep must be at most 24 and at least 1, got 25"),
         ({"size": 2, "keep": 0}, "keep must be at most 24 and at least 1, got 0"),
     ],
@@ -166,30 +154,3 @@ def test_impossible_sizes_are_refused(factored, options, message):
 def test_a_brdf_that_is_not_factored_is_refused():
     with pytest.raises(TypeError, match=r"must be factored, by jaxprt.separable.factor, got Lambert"):
         precompute(prt.scene.builtin.plane(cells=1), prt.brdf.Lambert(0.5), keep=4, size=2)
-
-
-@pytest.mark.parametrize("field", ["position", "normal", "tangent"])
-def test_values_that_are_not_finite_are_refused(factored, field):
-    mesh = prt.scene.builtin.plane(cells=1)
-    broken = prt.scene.Mesh(
-        **{
-            name: getattr(mesh, name).at[1, 0].set(jnp.nan) if name == field else getattr(mesh, name)
-            for name in vars(mesh)
-        }
-    )
-    with pytest.raises(ValueError, match="finite"):
-        precompute(broken, factored, keep=4, size=2)
-
-
-@pytest.mark.parametrize("vertex", [4, -5])
-def test_vertices_that_are_not_there_are_refused(factored, vertex):
-    mesh = prt.scene.builtin.plane(cells=1)
-    with pytest.raises(ValueError, match=rf"array of indices below 4, got int64 \(2,\): \[ ?0 +{vertex}\]"):
-        precompute(mesh, factored, keep=4, size=2, vertex=np.array([0, vertex]))
-
-
-def test_no_vertices_have_no_transport(factored):
-    mesh = prt.scene.builtin.plane(cells=1)
-    transport = precompute(mesh, factored, keep=4, size=2, vertex=np.zeros(0, int))
-    assert transport.value.shape == (4, 0, 3, 1)
-    np.testing.assert_array_equal(transport.rms, 0)
