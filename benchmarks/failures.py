@@ -21,7 +21,7 @@ from benchmarks.pictures import BRDFS, LIGHTS, standing
 from benchmarks.pictures import view as view_of
 from benchmarks.published import interiors
 from benchmarks.scenes import averaged, finer, traced_parts
-from jaxprt import Blend, bright_texels, dynamic, files, image, memory, precompute, radiance, reference
+from jaxprt import Blend, Run, bright_texels, dynamic, files, image, memory, precompute, radiance, reference
 from jaxprt.brdf import CookTorrance
 from jaxprt.image import raster
 from jaxprt.relit import Harmonics, Lobes, Terms
@@ -153,7 +153,7 @@ def changing(sizes: Sizes) -> Pictures:
     blend = Blend(jnp.ones((count, 1, 1)), (jnp.full(count, log_m),))
     for name, ends in {"m .035 and .56": (0.035, 0.56), "m .1 and .196": (0.1, 0.196)}.items():
         table = dynamic.tabulate(model, lobes=8, ranks=None, knot=[np.log(ends)])
-        transport = dynamic.precompute(mesh, table, progress=False)
+        transport = dynamic.precompute(mesh, table, run=Run(progress=False))
         system = bright_texels.BrightTexels(dynamic.DynamicSystem(transport, table), transport.pyramid, model)
         color = radiance(system, light, eye=camera.eye, materials=blend)
         mine[name] = (lambda color=color: image.render(mesh, color, camera)), memory(system)

@@ -175,11 +175,10 @@ def plan(
         members, names = [scene.parts[part] for part in own], tuple(scene.parts[part].name for part in own)
         sample = Sample.make(members, [shadings[part] for part in own], mesh, total, size, environments, views)
         count = len(sample.shading.mesh.position)
-        kept = run.within(f"{key}_{number}").path
         alone = None
         if len(own) == 1:
             alone = sample.alone(members[0], channels.of_part(members[0], look=looks[own[0]], takes=Terms().takes))
-        considered = tuple(_considered(sample, alone, kept, asked, count / total / rate))
+        considered = tuple(_considered(sample, alone, run.within(f"{key}_{number}"), asked, count / total / rate))
         good = [each for each in considered if each.error * MARGIN <= asked]
         if not good:
             best = min(considered, key=lambda each: each.error)
@@ -221,7 +220,7 @@ def key_of(scene: Scene, environments: Sequence[Environment]) -> str:
     return blocks.fingerprint(np.frombuffer(kinds.encode(), np.uint8), *arrays)
 
 
-def _considered(sample: Sample, alone: Sample | None, folder: pathlib.Path | None, error: float, seconds: float):
+def _considered(sample: Sample, alone: Sample | None, run: Run, error: float, seconds: float):
     """Measures candidates of each system: a bisection along its steps, to the first that meets the error.
 
     `alone` is the sample with a BRDF that can be factored; None for groups without such a BRDF.
@@ -238,7 +237,7 @@ def _considered(sample: Sample, alone: Sample | None, folder: pathlib.Path | Non
         while low < high:  # Assumption: from one step to the next, the error decreases by at most half.
             middle = (low + high) // 2
             recipe, measured = ladder[middle]
-            each = _measured(measured, recipe, folder)
+            each = _measured(measured, recipe, run)
             yield each
             if each.error * MARGIN > error:
                 halvings = math.log2(min(each.error, 1e6) * MARGIN / error)
@@ -260,11 +259,11 @@ def _ladder(recipe: Recipe, sample: Sample, alone: Sample | None) -> list[tuple[
     return [] if alone is None else [(step, alone) for step in steps]
 
 
-def _measured(sample: Sample, recipe: Recipe, folder: pathlib.Path | None) -> Candidate:
+def _measured(sample: Sample, recipe: Recipe, run: Run) -> Candidate:
     """Measures a candidate, or loads its measurement from a folder."""
-    if folder is None:
+    if run.path is None:
         return sample.measure(recipe)
-    path = folder / re.sub(r"\W+", "_", str(recipe))
+    path = pathlib.Path(run.path, re.sub(r"\W+", "_", str(recipe)))
     if not path.exists():
         objects.save(path, sample.measure(recipe))
     found = objects.load(path)

@@ -1,5 +1,7 @@
 """Transport for BRDFs that change: the light factors, compressed by clusters of vertices, and visibility for lobes."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -93,7 +95,7 @@ def precompute(
     lobe.pyramid.scales(size)
     where = {"size": size, "occluder": occluder, "vertex": vertex}
     visible = visibility.precompute(mesh, **where, run=run.within("visibility.prt"))
-    sizes = {"components": components, "modes": modes, "keep": keep}
+    sizes: Any = {"components": components, "modes": modes, "keep": keep}
     return compress(visible, brdf, **sizes, run=run.within("clusters.prt"))
 
 
@@ -127,7 +129,7 @@ def compress(
 
 def clustering(
     vertices: int, terms: int, texels: int, components: int, modes: int, keep: int
-) -> tuple[int, dict[str, int]]:
+) -> tuple[int, dict[str, Any]]:
     """Number of clusters, and sizes of the compression, limited by what there is."""
     clusters = max(1, round(vertices / _MEMBERS), min(_CLUSTERS, vertices // _FEWEST))
     components, keep = min(components, vertices // clusters), min(keep, texels)
