@@ -199,13 +199,13 @@ def _plan(scene: Scene, folder: pathlib.Path | None, **options) -> Plan:
     if store is not None and store.exists():
         stored, environments = objects.load(store), options["environments"]
         if not isinstance(stored, Plan):
-            raise ValueError(f"{kept} is damaged: it must hold a plan, got a {type(found).__name__}")
+            raise ValueError(f"{store} is damaged: it must hold a plan, got a {type(stored).__name__}")
         if stored.key != key_of(centered(scene), lights_of(scene) if environments is None else environments):
-            raise ValueError(f"{kept} was made for another scene, other materials or other lights: name another path")
+            raise ValueError(f"{store} was made for another scene, other materials or other lights: name another path")
         asked = ERROR if options["error"] is None else options["error"]
         if (stored.asked, stored.rate) != (asked, options["rate"]):
             raise ValueError(
-                f"{kept} was made for an error of {found.asked:g} at {found.rate:g} frames per second, "
+                f"{store} was made for an error of {stored.asked:g} at {stored.rate:g} frames per second, "
                 f"got {asked:g} at {options['rate']:g}: name another path"
             )
         if options["error"] is None or stored.error * MARGIN <= asked:

@@ -710,7 +710,7 @@ def _check_blend(name: str, shading: Shading, blend: Blend | None) -> None:
     assert precomputed is not None
     if blend is None or len(blend.parameter) != len(precomputed.parameter):
         got = "no weights" if blend is None else f"{len(blend.parameter)} parameters"
-        raise ValueError(f"the material of part {name!r} must have {len(own.parameter)} parameters, got {got}")
+        raise ValueError(f"the material of part {name!r} must have {len(precomputed.parameter)} parameters, got {got}")
     blend.check(len(precomputed.weight), precomputed.weight.shape[1])
 
 
