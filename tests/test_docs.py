@@ -22,7 +22,8 @@ import pytest
 import trimesh
 
 import jaxprt as prt
-from jaxprt.relit import Clusters, Harmonics, recipes
+from jaxprt.files import extensions
+from jaxprt.relit import Clusters, Harmonics, recipes, registry
 
 pytestmark = pytest.mark.documents
 
@@ -215,6 +216,8 @@ def place(files: pathlib.Path, unchecked: None, tmp_path: pathlib.Path, monkeypa
     monkeypatch.setenv("JAXPRT_NOTEBOOKS", "small")
     monkeypatch.setattr("webbrowser.open", lambda *arguments, **options: True)
     monkeypatch.setattr(prt.view.Server, "wait", prt.view.Server.close)
+    for module, name in ((registry, "SYSTEMS"), (registry, "MATERIALS"), (extensions, "CLASSES")):
+        monkeypatch.setattr(module, name, dict(getattr(module, name)))  # What a page registers, no other page has.
     monkeypatch.setattr(plt, "show", lambda: None)
     with matplotlib.rc_context({"backend": "agg"}):
         yield tmp_path

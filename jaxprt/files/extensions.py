@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import importlib.metadata
 import warnings
+from collections.abc import Sequence
 
 GROUP = "jaxprt"  # of entry points, each of which names a module
 CLASSES: dict[str, type] = {}  # by full name
@@ -19,16 +20,17 @@ def is_data(kind: type) -> bool:
     return dataclasses.is_dataclass(kind) or (issubclass(kind, tuple) and hasattr(kind, "_fields"))
 
 
-def allow(kind: type) -> None:
-    """Lets files hold objects of a data class of another package. Its fields are annotated as those of jaxprt are.
+def allow(kinds: Sequence[type]) -> None:
+    """Lets files hold objects of data classes of another package. Their fields are annotated as those of jaxprt are.
 
     Raises:
-        TypeError: It is not a data class.
+        TypeError: One of them is not a data class.
     """
-    if not isinstance(kind, type) or not is_data(kind):
-        name = getattr(kind, "__name__", kind)
-        raise TypeError(f"what is registered must consist of data classes, such as equinox.Module, got {name}")
-    CLASSES[full_name(kind)] = kind
+    for kind in kinds:
+        if not isinstance(kind, type) or not is_data(kind):
+            name = getattr(kind, "__name__", kind)
+            raise TypeError(f"what is registered must consist of data classes, such as equinox.Module, got {name}")
+    CLASSES.update({full_name(kind): kind for kind in kinds})
 
 
 def modules() -> set[str]:

@@ -50,7 +50,7 @@ def register(name: str, extension: Recipe | type) -> None:
     """Registers a system or a BRDF of another package, so that it is used by its name and files may hold it.
 
     `jaxprt.precompute(scene, system=name)`, `jaxprt.plan` and the option --system take a system, and the option
-    --material a BRDF. `jaxprt.files.save` and `load` take objects of the registered classes: that of the BRDF, or that
+    --brdf a BRDF. `jaxprt.files.save` and `load` take objects of the registered classes: that of the BRDF, or that
     of the recipe and its `classes`.
 
     A package that is installed names the module that calls this function as an entry point of the group "jaxprt". It is
@@ -78,8 +78,7 @@ def register(name: str, extension: Recipe | type) -> None:
     owner = "jaxprt" if name in ours else _owner(named.get(name, extension))
     if owner != full:
         raise ValueError(f"the name {name!r} belongs to {owner}: register {full} by another one")
-    for kind in classes:
-        extensions.allow(kind)
+    extensions.allow(classes)
     named[name] = extension
 
 
