@@ -25,6 +25,7 @@ ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "transfer": 4}
 DEGREE = gather.DEGREE  # degree of the harmonics that arrive
 _GROUPS = 128  # groups of rays that are summed by one program
 _AGAIN = 2  # edge of the light's faces for two bounces
+_COARSE = 8  # edge of the faces of rays for two bounces, of which fewer would not be enough
 _SAMPLE = 4096  # most vertices of a basis from whose responses the modes of the light are found
 _DIM = 0.03  # responses of vertices count relative to their size, unless they are this small beside the mean
 
@@ -301,7 +302,7 @@ class TransferJob(_PathJob):
                     responses = gather.respond_again(arriving, jnp.asarray(self.frame[member]), basis)
                     response[number][local[member[here]]] = np.asarray(responses)[here].swapaxes(1, 2)
         same = {field.name: getattr(self, field.name) for field in fields(_PathJob)}
-        changed = {"response": tuple(response), "components": components, "size": max(self.size // 2, 1)}
+        changed = {"response": tuple(response), "components": components, "size": max(self.size // 2, min(self.size, _COARSE))}
         return AgainJob(**{**same, **changed}, function=function)
 
 

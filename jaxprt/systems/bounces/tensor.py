@@ -60,7 +60,8 @@ class TransferTensor(eqx.Module):
             its one BRDF.
         second: Two bounces; None if not requested, or omitted.
         error: Relative L2 error of each cluster's tensor due to the decomposition, with each function at its largest
-            possible weight. It is computed as a difference of squares: values below 5e-4 are rounding.
+            possible weight, and without what the modes by which light is gathered leave out. It is computed as a
+            difference of squares: values below 5e-4 are rounding.
         worth: Contribution of each bounce for white surfaces under uniform light: RMS irradiance relative to the
             irradiance of an unoccluded surface. Regions with one BRDF use that BRDF. With "all" bounces, the last value
             is that of all bounces after the second together.

@@ -78,11 +78,11 @@ def test_bounces_under_constant_light_are_those_of_the_harmonic_system():
     one, two = (harmonic.interreflect_diffuse(mesh, plain, albedo, bounces=n, **options) for n in (1, 2))
     exact = [np.asarray(b.vector - a.vector)[0].T * np.sqrt(4 * np.pi) for a, b in ((plain, one), (one, two))]
     assert relative(np.einsum("vs,vsc->vc", at, once), exact[0]) < 0.014
-    assert relative(np.einsum("vs,vsc->vc", at, twice), exact[1]) < 0.018
+    assert relative(np.einsum("vs,vsc->vc", at, twice), exact[1]) < 0.035  # A quarter of the rays.
     bright = albedo.max(1, keepdims=True)
     one, two = (harmonic.interreflect_diffuse(mesh, plain, bright, bounces=n, **options) for n in (1, 2))
     brought = [np.asarray(b.vector - a.vector)[0] * np.sqrt(4 * np.pi) for a, b in ((plain, one), (one, two))]
-    assert np.all(np.abs(tensor.worth / np.sqrt(np.mean(np.square(brought), (1, 2))) - 1) < [0.003, 0.015])
+    assert np.all(np.abs(tensor.worth / np.sqrt(np.mean(np.square(brought), (1, 2))) - 1) < [0.003, 0.03])
 
 
 def test_two_bounces_are_a_loop_over_rays_of_rays(mesh, brdfs, whole):
@@ -212,7 +212,8 @@ def test_fewer_components_and_modes_err_as_they_say(mesh, brdfs, whole):
     weight = jnp.tile(jnp.diag(bounces.tensor.scales(whole.factor)), texels)
     exact, found = (arriving(each, lamp, weight)[0] for each in (whole, cut))
     assert float(cut.error[0]) > 0.01
-    np.testing.assert_allclose(relative(found, exact), float(cut.error[0]), rtol=1e-3)
+    # Besides, gathering by 36 modes of the light of 96 texels leaves a little.
+    np.testing.assert_allclose(relative(found, exact), float(cut.error[0]), rtol=0.03)
 
 
 @pytest.fixture(scope="module")
