@@ -134,7 +134,6 @@ HOST = {
     "systems.separable.clustered.precompute": "runs workers and writes files",
     "systems.separable.clustered.compress": "gives half precision, and vectors of either sign: no one dtype or answer",
     "systems.separable.sparse.rms": "counts on the host, after precomputation",
-    "systems.harmonic.interreflection": "traces rays",
     "systems.harmonic.transfer.precompute": "traces rays",
     "systems.harmonic.transfer.precompute_diffuse": "traces rays",
     "systems.harmonic.transfer.check": "checks values",

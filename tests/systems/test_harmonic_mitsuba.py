@@ -19,9 +19,10 @@ from jaxtyping import Array, Float
 
 import jaxprt as prt
 from benchmarks.published.harmonics import unshadowed_radiance
+from benchmarks.published.interreflection import interreflect, interreflect_diffuse
 from jaxprt import harmonic
 from jaxprt.scene.environment import environment_from_image
-from jaxprt.systems.harmonic import interreflect, interreflect_diffuse, precompute, precompute_diffuse, tabulate
+from jaxprt.systems.harmonic import precompute, precompute_diffuse, tabulate
 
 DEGREE = 4
 BOUNCES = 2

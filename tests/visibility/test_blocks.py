@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 import jaxprt as prt
+from benchmarks.published import interreflection
 from jaxprt import bounces, harmonic, lobe, separable, visibility
 from jaxprt.files.arrays import BlockStore, Layout
 from jaxprt.scene.mesh import join, make_mesh
@@ -528,8 +529,8 @@ def test_headers_of_all_traced_systems_name_versions_and_no_computed_float(spher
         (lobe.pyramid._Job, {}),
         (harmonic.transfer._Job, {"degree": 1, "diffuse": False}),
         (harmonic.transfer._Job, {"degree": 1, "diffuse": True}),
-        (harmonic.interreflection._BounceJob, {"brdf": (), "rows": rows}),
-        (harmonic.interreflection._DiffuseBounceJob, {"rows": rows[:, 0], "albedo": np.ones((1, 1), int)}),
+        (interreflection._BounceJob, {"brdf": (), "rows": rows}),
+        (interreflection._DiffuseBounceJob, {"rows": rows[:, 0], "albedo": np.ones((1, 1), int)}),
         (bounces.jobs.ResponseJob, {"basis": brdf, "edge": 1}),
         (bounces.jobs.TransferJob, more | {"modes": 1}),
         (bounces.jobs.AgainJob, more | {"function": np.arange(1)}),

@@ -302,7 +302,11 @@ class TransferJob(_PathJob):
                     responses = gather.respond_again(arriving, jnp.asarray(self.frame[member]), basis)
                     response[number][local[member[here]]] = np.asarray(responses)[here].swapaxes(1, 2)
         same = {field.name: getattr(self, field.name) for field in fields(_PathJob)}
-        changed = {"response": tuple(response), "components": components, "size": max(self.size // 2, min(self.size, _COARSE))}
+        changed = {
+            "response": tuple(response),
+            "components": components,
+            "size": max(self.size // 2, min(self.size, _COARSE)),
+        }
         return AgainJob(**{**same, **changed}, function=function)
 
 

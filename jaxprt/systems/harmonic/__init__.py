@@ -4,7 +4,6 @@ from jaxprt.systems.harmonic import system as system
 from jaxprt.systems.harmonic import table as table
 from jaxprt.systems.harmonic import transfer as transfer
 from jaxprt.systems.harmonic.exchange import export_transfer, import_transfer
-from jaxprt.systems.harmonic.interreflection import interreflect, interreflect_diffuse
 from jaxprt.systems.harmonic.system import DiffuseSystem, HarmonicSystem, probe_light, project
 from jaxprt.systems.harmonic.table import HarmonicBrdf, tabulate
 from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector, precompute, precompute_diffuse
@@ -17,8 +16,6 @@ __all__ = [
     "TransferVector",
     "export_transfer",
     "import_transfer",
-    "interreflect",
-    "interreflect_diffuse",
     "precompute",
     "precompute_diffuse",
     "probe_light",

@@ -78,7 +78,7 @@ class HarmonicSystem(protocol.VertexSystem):
     can make radiance negative.
 
     Attributes:
-        transport: Transfer matrices, from `jaxprt.harmonic.precompute` or `jaxprt.harmonic.interreflect`.
+        transport: Transfer matrices, from `jaxprt.harmonic.precompute`.
         brdf: The table, from `jaxprt.harmonic.tabulate`.
         laplacian: Share of the light's squared Laplacian that remains after windowing against ringing, from 0 to 1.
             With 1 there is no window. See `jaxprt.sphere.harmonics.least_laplacian`.

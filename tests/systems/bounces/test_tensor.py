@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.published.interreflection import interreflect_diffuse
 from jaxprt import bounces, harmonic, separable, visibility
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.brdf.models import CookTorrance
@@ -75,12 +76,12 @@ def test_bounces_under_constant_light_are_those_of_the_harmonic_system():
     at = np.asarray(harmonics.evaluate(mesh.normal, degree=3)) * cosine / np.pi
     plain = harmonic.precompute_diffuse(mesh, degree=0, size=SEEN)
     options = {"size": SEEN}
-    one, two = (harmonic.interreflect_diffuse(mesh, plain, albedo, bounces=n, **options) for n in (1, 2))
+    one, two = (interreflect_diffuse(mesh, plain, albedo, bounces=n, **options) for n in (1, 2))
     exact = [np.asarray(b.vector - a.vector)[0].T * np.sqrt(4 * np.pi) for a, b in ((plain, one), (one, two))]
     assert relative(np.einsum("vs,vsc->vc", at, once), exact[0]) < 0.014
     assert relative(np.einsum("vs,vsc->vc", at, twice), exact[1]) < 0.035  # A quarter of the rays.
     bright = albedo.max(1, keepdims=True)
-    one, two = (harmonic.interreflect_diffuse(mesh, plain, bright, bounces=n, **options) for n in (1, 2))
+    one, two = (interreflect_diffuse(mesh, plain, bright, bounces=n, **options) for n in (1, 2))
     brought = [np.asarray(b.vector - a.vector)[0] * np.sqrt(4 * np.pi) for a, b in ((plain, one), (one, two))]
     assert np.all(np.abs(tensor.worth / np.sqrt(np.mean(np.square(brought), (1, 2))) - 1) < [0.003, 0.03])
 

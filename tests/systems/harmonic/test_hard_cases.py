@@ -8,14 +8,13 @@ import trimesh
 
 import jaxprt as prt
 from benchmarks.published.harmonics import unshadowed_radiance
+from benchmarks.published.interreflection import interreflect, interreflect_diffuse
 from jaxprt import harmonic, reference
 from jaxprt.brdf import CookTorrance, Lambert, Phong, Ward
 from jaxprt.scene import Environment, builtin
 from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.sphere import cubemap, directions, harmonics, rotation
 from jaxprt.systems.harmonic import (
-    interreflect,
-    interreflect_diffuse,
     precompute,
     precompute_diffuse,
     tabulate,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxprt as prt
+from benchmarks.published.interreflection import interreflect, interreflect_diffuse
 from jaxprt import harmonic
 from jaxprt.brdf import Lambert
 from jaxprt.scene import builtin
@@ -15,8 +16,6 @@ from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.systems.harmonic import (
     HarmonicBrdf,
     TransferVector,
-    interreflect,
-    interreflect_diffuse,
     precompute,
     precompute_diffuse,
     tabulate,
