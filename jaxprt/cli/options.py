@@ -457,7 +457,7 @@ class SystemName(click.Choice):
     """Names of systems: some of jaxprt's, and those of other packages."""
 
     @property
-    def choices(self) -> tuple[str, ...]:
+    def choices(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """All names."""
         return (*self._names, *(name for name in registry.systems() if name not in NAMES))
 

@@ -69,6 +69,7 @@ def register(name: str, extension: Recipe | type) -> None:
     """
     if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_-]*", name):
         raise ValueError(f"the name must consist of a-z, 0-9, - and _, with a letter first, got {require.shown(name)}")
+    named: dict[str, Any]
     if isinstance(extension, Recipe):
         named, ours, classes = SYSTEMS, _OURS[0], (type(extension), *extension.classes)
     else:

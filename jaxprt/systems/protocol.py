@@ -224,8 +224,8 @@ class Exported(eqx.Module):
     @property
     def description(self) -> dict[str, Any]:
         """Numbers by which the page's module reads the arrays."""
-        varies = self.brdf is not None and self.brdf.knot
-        knot = np.asarray(self.brdf.knot[0], float).tolist() if varies else []
+        knots = getattr(self.brdf, "knot", ())
+        knot = np.asarray(knots[0], float).tolist() if knots else []
         return {"lobes": 0, "bands": 0, "words": 0, "steps": 0.0, "knot": knot, "laplacian": 1.0}
 
     def table(self, what: str) -> Float[np.ndarray, "h q e 4"]:

@@ -90,7 +90,10 @@ class PageScene:
         systems: list[System] = [part.relit() for part in self.parts]
         if self.texels is not None:
             rows = zip(systems, self.texels, self.parts, self.shading, strict=True)
-            systems = [system if seen is None else _with_texels(system, seen, *row) for system, seen, *row in rows]
+            systems = [
+                system if seen is None else _with_texels(system, seen, part, shading)
+                for system, seen, part, shading in rows
+            ]
         return RelitScene(self.scene, self.shading, Place.apart(self.scene.counts), systems)
 
     @property
