@@ -114,7 +114,7 @@ def _views() -> Views:
     wo, share = jnp.asarray(wo, jnp.float32), jnp.asarray(share, jnp.float32)
     wi, area = jax.vmap(partial(hemisphere.arcs, rings=_RINGS, sectors=_SECTORS))(em.mirror(wo))
     band = np.repeat(np.asarray(harmonics.natural(degree=_DEGREE)), 2 * np.arange(_DEGREE + 1) + 1)
-    basis = jnp.stack([harmonics.evaluate(each, degree=_DEGREE) for each in wi])
+    basis = jnp.stack([harmonics.evaluate(direction, degree=_DEGREE) for direction in wi])
     return Views(wo, wi, area, basis * jnp.asarray(band, jnp.float32) * area[..., None], share)
 
 
@@ -132,14 +132,14 @@ def _descend(state, table, family, weight, views, free, bound, first, number, *,
     def step(state, count):
         change, mean, square = state
         gradient = jax.grad(_error)(change, table, family, weight, views, first, jax.random.key(count.astype(int)))
-        gradient = jax.tree.map(lambda each: each * free, gradient)
+        gradient = jax.tree.map(lambda leaf: leaf * free, gradient)
         rate = _RATE * jnp.minimum(1, count / _WARM) * 0.5 * (1 + jnp.cos(np.pi * count / steps))
         one, two = _MEMORY
         mean = jax.tree.map(lambda a, b: one * a + (1 - one) * b, mean, gradient)
         square = jax.tree.map(lambda a, b: two * a + (1 - two) * b**2, square, gradient)
         rate = rate / (1 - one ** (count + 1)) * jnp.sqrt(1 - two ** (count + 1))
         change = jax.tree.map(lambda x, a, b: x - rate * a / (jnp.sqrt(b) + _TINY), change, mean, square)
-        change = eqx.tree_at(lambda each: each.scale, change, jnp.clip(change.scale, *bound))
+        change = eqx.tree_at(lambda change: change.scale, change, jnp.clip(change.scale, *bound))
         return (change, mean, square), None
 
     return jax.lax.scan(step, state, number + jnp.arange(_CHUNK))[0]
@@ -151,15 +151,15 @@ def _error(
     """The error E for random parameters, views and materials."""
     changed, keys = _table(change, table), jax.random.split(key, 3)
     place = (jnp.arange(_PARAMETERS) + jax.random.uniform(keys[0], (_PARAMETERS,))) / _PARAMETERS
-    chosen = 3 * jnp.arange(_VIEWS // 3) + jax.random.randint(keys[1], (_VIEWS // 3,), 0, 3)
+    index = 3 * jnp.arange(_VIEWS // 3) + jax.random.randint(keys[1], (_VIEWS // 3,), 0, 3)
     weight = jax.random.choice(keys[2], weight, (_SUMS,), replace=False)
-    some = jax.tree.map(lambda each: each[chosen], views)
+    view = jax.tree.map(lambda leaf: leaf[index], views)
 
     def one(parameter):
-        lobes = changed.lookup(some.wo, jnp.full(len(some.wo), parameter))
+        lobes = changed.lookup(view.wo, jnp.full(len(view.wo), parameter))
         arrays = lobes.mean, lobes.concentration, lobes.weight, lobes.diffuse
-        wrong, whole = jax.vmap(partial(_seen, family(parameter), weight), (0, 2, 1, 2, 1))(some, *arrays)
-        share = some.share[:, None, None]
+        wrong, whole = jax.vmap(partial(_square_norms, family(parameter), weight), (0, 2, 1, 2, 1))(view, *arrays)
+        share = view.share[:, None, None]
         total = jnp.sum(wrong * share, 0) / jnp.sum(whole * share, 0)
         return jnp.mean(total @ jnp.array([1, _FINE])) + _EVERY_VIEW * jnp.mean(wrong[..., 0] / whole[..., 0])
 
@@ -167,7 +167,7 @@ def _error(
     return jnp.mean(jax.vmap(one)(first + (last - first) * place))
 
 
-def _seen(
+def _square_norms(
     brdf: Callable, material: Array, view: Views, mean: Array, concentration: Array, weight: Array, diffuse: Array
 ) -> tuple[Array, Array]:
     """Squared norm of the error of a view and of what it sees, for each material: by harmonics, and by direction."""

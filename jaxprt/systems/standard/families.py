@@ -23,8 +23,8 @@ class RoughnessFamily(eqx.Module):
 
     def __call__(self, log_roughness: Float[Array, ""] | float) -> Channels:
         """The BRDF for the natural logarithm of a roughness."""
-        each = MetallicRoughness(roughness=jnp.exp(log_roughness), anisotropy=self.anisotropy).terms()
-        return Channels(tuple(each[k] for k in self.term), self.scale)
+        terms = MetallicRoughness(roughness=jnp.exp(log_roughness), anisotropy=self.anisotropy).terms()
+        return Channels(tuple(terms[k] for k in self.term), self.scale)
 
 
 class ShininessFamily(eqx.Module):

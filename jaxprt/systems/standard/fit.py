@@ -71,7 +71,7 @@ class Material(NamedTuple):
         return np.linspace(np.log(self.smoothest), 0, self.knot_count)
 
 
-def material(name: str) -> Material:
+def material_of(name: str) -> Material:
     """The material of a file."""
     random = np.random.default_rng(0)
     base, other = random.uniform(0.05, 1, (2, 60, 1)).astype(np.float32)
@@ -90,10 +90,10 @@ def material(name: str) -> Material:
         return Material(SheenFamily(jnp.asarray(scale)), scale, sheen.SMOOTHEST, base, sheen.SMOOTHEST, knot, 1, FEW)
     scale = np.array([0.1, 1.0, 1.0, 0.02], np.float32)
     metallic, specular = (
-        np.resize(each, 60).astype(np.float32) for each in ([0, 0, 1, 1, 0.3, 0.6], [1, 0.6, 1, 1, 0.5])
+        np.resize(values, 60).astype(np.float32) for values in ([0, 0, 1, 1, 0.3, 0.6], [1, 0.6, 1, 1, 0.5])
     )
-    made = MetallicRoughness(base_color=base, metallic=metallic, specular=specular)
-    weight = np.asarray(made.coefficient())[..., 0] / scale
+    brdf = MetallicRoughness(base_color=base, metallic=metallic, specular=specular)
+    weight = np.asarray(brdf.coefficient())[..., 0] / scale
     family = RoughnessFamily((0, 1, 2, 3), jnp.asarray(scale), jnp.zeros(()))
     return Material(family, scale, 1e-3**0.5, weight, 0.3, _spread(1e-3**0.5, 2), 2)
 
@@ -103,15 +103,15 @@ def _spread(smoothest: float, power: int, count: int = 16) -> np.ndarray:
     return np.log(np.linspace(smoothest ** (power / 2), 1, count)) * 2 / power
 
 
-def lobes(made: Material, count: int) -> dict[str, np.ndarray]:
+def lobes(material: Material, count: int) -> dict[str, np.ndarray]:
     """Arrays of a table of lobes: those of the `LobeBrdf`, rounded, and its errors at and halfway between the knots."""
-    table = lobe.tabulate(made.family, lobes=count, knot=(made.knots,))
-    least = np.stack([_least(made.family(jnp.asarray(each)), count) for each in made.knots], 1)
-    table = descent.improve(table, made.family, made.weight, least, first=float(np.log(made.first)), steps=STEPS)
-    mean = np.round(np.asarray(table.mean) * tables.UNIT).astype(np.int16)
-    scale, weight, diffuse = (
-        np.asarray(each).astype(np.float16) for each in (table.scale, table.weight, table.diffuse)
+    table = lobe.tabulate(material.family, lobes=count, knot=(material.knots,))
+    least = np.stack([_least(material.family(jnp.asarray(knot)), count) for knot in material.knots], 1)
+    table = descent.improve(
+        table, material.family, material.weight, least, first=float(np.log(material.first)), steps=STEPS
     )
+    mean = np.round(np.asarray(table.mean) * tables.UNIT).astype(np.int16)
+    scale, weight, diffuse = (np.asarray(row).astype(np.float16) for row in (table.scale, table.weight, table.diffuse))
     rounded = LobeBrdf(
         jnp.asarray(mean / tables.UNIT, jnp.float32),
         jnp.asarray(scale, jnp.float32),
@@ -120,7 +120,7 @@ def lobes(made: Material, count: int) -> dict[str, np.ndarray]:
         table.knot,
         table.error,
     )
-    error = errors(rounded, made.family, between(made.knots)).astype(np.float32)
+    error = errors(rounded, material.family, between(material.knots)).astype(np.float32)
     return {"mean": mean, "scale": scale, "weight": weight, "diffuse": diffuse, "error": error}
 
 
@@ -139,47 +139,47 @@ def errors(
     table: LobeBrdf, family: RoughnessFamily | ShininessFamily | SlopeFamily | SheenFamily, places: np.ndarray
 ) -> np.ndarray:
     """Error of a table at each of some roughnesses, under natural light, of the sum of all channels."""
-    each = (jnp.asarray(place, table.scale.dtype) for place in places)
-    return np.array([measured_error(family(place), table.at(place)) for place in each])
+    knots = (jnp.asarray(place, table.scale.dtype) for place in places)
+    return np.array([measured_error(family(knot), table.at(knot)) for knot in knots])
 
 
-def harmonics(made: Material) -> dict[str, np.ndarray]:
+def harmonics(material: Material) -> dict[str, np.ndarray]:
     """Arrays of the table of harmonics, up to degree 4."""
-    table = harmonic.tabulate(made.family, degree=4, error=0.02, resolution=ANGLES, knot=(made.knot,))
+    table = harmonic.tabulate(material.family, degree=4, error=0.02, resolution=ANGLES, knot=(material.knot,))
     return {
         "harmonics": np.asarray(table.table).astype(np.float16),
-        "harmonics.knot": np.asarray(made.knot, np.float32),
+        "harmonics.knot": np.asarray(material.knot, np.float32),
         "harmonics.error": np.asarray(table.error, np.float32),
     }
 
 
-def columns(made: Material, table: LobeBrdf) -> dict[str, np.ndarray]:
+def columns(material: Material, table: LobeBrdf) -> dict[str, np.ndarray]:
     """What does not follow the table: curvatures, numbers of samples, and albedos of the traced lobes, at the knots.
 
     A sheen has no numbers of samples: it is dark around the mirror direction, where these are measured, and wide
     elsewhere.
     """
-    held = {
-        "zonal": np.stack([_zonal(made.family(jnp.asarray(each))) for each in made.knots]).astype(np.float16),
+    arrays = {
+        "zonal": np.stack([_zonal(material.family(jnp.asarray(knot))) for knot in material.knots]).astype(np.float16),
         "albedo": np.moveaxis(np.asarray(traced.albedos(table)), 1, 2).astype(np.float32),
     }
-    if isinstance(made.family, SheenFamily):
-        return held
-    finer = np.interp(np.arange(FINER * (KNOTS - 1) + 1) / FINER, np.arange(KNOTS), made.knots)
+    if isinstance(material.family, SheenFamily):
+        return arrays
+    finer = np.interp(np.arange(FINER * (KNOTS - 1) + 1) / FINER, np.arange(KNOTS), material.knots)
     # A cubemap of fewer texels needs as many samples for the smoothest lobes as 64 x 64 texels for smoother ones.
     coarse = np.arange(SMALLEST, tables.TEXELS, FINER)
-    place = np.append(finer[0] + np.log(coarse / tables.TEXELS) / made.power, finer)
+    place = np.append(finer[0] + np.log(coarse / tables.TEXELS) / material.power, finer)
     size = np.append(coarse, np.full(len(finer), tables.TEXELS))
     samples = [
-        bright_texels.samples_for(made.family(jnp.asarray(max(where, finer[0]))), size=int(edge))
+        bright_texels.samples_for(material.family(jnp.asarray(max(where, finer[0]))), size=int(edge))
         for where, edge in zip(place, size, strict=True)
     ]
-    return held | {"samples": np.array(samples, np.uint8), "samples.knot": place.astype(np.float32)}
+    return arrays | {"samples": np.array(samples, np.uint8), "samples.knot": place.astype(np.float32)}
 
 
-def tensor(made: Material, table: LobeBrdf) -> dict[str, np.ndarray]:
+def tensor(material: Material, table: LobeBrdf) -> dict[str, np.ndarray]:
     """Arrays of the tensor for what the lobes of a table leave, and what its diffuse part is to be changed by."""
-    brdf = dynamic.tabulate(made.family, lobes=table, ranks=tables.RANKS, knot=(made.knots,))
+    brdf = dynamic.tabulate(material.family, lobes=table, ranks=tables.RANKS, knot=(material.knots,))
     return {
         "tensor.core": np.asarray(brdf.core, np.float32),
         "tensor.factor": np.asarray(brdf.factor, np.float32),
@@ -200,22 +200,22 @@ def _zonal(brdf: Channels) -> Float[np.ndarray, "l k"]:
     return np.polynomial.legendre.legvander(np.clip(wi @ mirror, -1, 1), BANDS).T @ mass
 
 
-def paths(made: Material) -> dict[str, np.ndarray]:
+def paths(material: Material) -> dict[str, np.ndarray]:
     """Functions of light paths for all roughnesses, and their weights; see `jaxprt.relit.paths.factored`."""
-    scale = np.asarray(made.scale, np.float64)
+    scale = np.asarray(material.scale, np.float64)
     matte = np.isin(np.arange(len(scale)), _DIFFUSE)
-    place = np.maximum(made.knots, np.log(_WIDTH) / made.power)
+    place = np.maximum(material.knots, np.log(_WIDTH) / material.power)
     first = np.flatnonzero(np.append(np.diff(place) > 0, True))
-    wide = [made.family(jnp.asarray(each)) for each in place[first]]
-    wide = [Channels(tuple(np.array(each.model, object)[~matte]), jnp.ones(int((~matte).sum()))) for each in wide]
+    models = [np.array(material.family(jnp.asarray(knot)).model, object)[~matte] for knot in place[first]]
+    brdfs = [Channels(tuple(model), jnp.ones(len(model))) for model in models]
     options = {"functions": _FUNCTIONS, "terms": _TERMS, "resolution": _RESOLUTION}
-    brdf, weight = bounces.functions.shared(wide, **options)
+    brdf, weight = bounces.functions.shared(brdfs, **options)
     factor = np.zeros((KNOTS, len(scale), brdf.view_map.shape[-1]))
     factor[:, ~matte] = np.asarray(weight)[np.searchsorted(first, np.arange(KNOTS))]
     factor[:, matte, -1] = 1
-    kept = factor @ np.asarray(bounces.functions.albedo(brdf), np.float64)
-    true = np.stack([_albedo(made.family(jnp.asarray(each))) for each in made.knots])
-    factor *= np.where(kept > _DARK, true / np.maximum(kept, _DARK), 1)[..., None]
+    albedo = factor @ np.asarray(bounces.functions.albedo(brdf), np.float64)
+    exact = np.stack([_albedo(material.family(jnp.asarray(knot))) for knot in material.knots])
+    factor *= np.where(albedo > _DARK, exact / np.maximum(albedo, _DARK), 1)[..., None]
     return {
         "path.light": np.asarray(brdf.light_map).astype(np.float16),
         "path.view": np.asarray(brdf.view_map).astype(np.float16),
@@ -243,21 +243,21 @@ def main(options: Sequence[str]) -> None:
     parser.add_argument("--only", nargs="*", default=kinds, choices=kinds)
     arguments = parser.parse_args(options)
     for name in arguments.material or names:
-        made = material(name)
-        _add(name, {"channel": made.scale, "knot": made.knots.astype(np.float32)})
+        material = material_of(name)
+        _add(name, {"channel": material.scale, "knot": material.knots.astype(np.float32)})
         for count in arguments.lobes if "lobes" in arguments.only else ():
-            _add(name, {f"lobes{count}.{key}": value for key, value in _timed(lobes, made, count).items()})
+            _add(name, {f"lobes{count}.{key}": value for key, value in _report(lobes, material, count).items()})
         if "harmonics" in arguments.only:
-            _add(name, _timed(harmonics, made))
+            _add(name, _report(harmonics, material))
         if "columns" in arguments.only:
-            _add(name, _timed(columns, made, tables.StandardTable(name).lobes()))
+            _add(name, _report(columns, material, tables.StandardTable(name).lobes()))
         if "paths" in arguments.only and name in _SENDING:
-            _add(name, _timed(paths, made))
+            _add(name, _report(paths, material))
         if "tensor" in arguments.only and name != tables.SHEEN.name:
-            _add(name, _timed(tensor, made, tables.StandardTable(name).lobes(tables.TENSOR_LOBES)))
+            _add(name, _report(tensor, material, tables.StandardTable(name).lobes(tables.TENSOR_LOBES)))
 
 
-def _timed(function, *argument):
+def _report(function, *argument):
     """The arrays that a function returns; prints their bytes and the processor seconds."""
     start = time.process_time()
     result = function(*argument)

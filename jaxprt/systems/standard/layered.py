@@ -42,7 +42,7 @@ class _Layer(NamedTuple):
         first: Index of the first of its coefficients.
         table: The table with the lobe of the layer.
         channel: Index of its channel there.
-        taken: Share of the light that a full layer takes from what is under it, at cosines of views, for each
+        loss: Share of the light that a full layer takes from what is under it, at cosines of views, for each
             roughness: a function of the cosines and of the logarithms of the roughness.
         reflects: Whether the lobe of the table, of albedo 1, is to be multiplied by that share. The lobe of a sheen
             has its own albedo.
@@ -51,26 +51,25 @@ class _Layer(NamedTuple):
     first: int
     table: StandardTable
     channel: int
-    taken: Callable[[Float[np.ndarray, " v"], Float[np.ndarray, " n"]], Float[np.ndarray, "n v"]]
+    loss: Callable[[Float[np.ndarray, " v"], Float[np.ndarray, " n"]], Float[np.ndarray, "n v"]]
     reflects: bool
 
-    def sent(self, cosine: Float[np.ndarray, " v"]) -> Float[np.ndarray, "n v"]:
-        """Factor of the lobe at its knots."""
-        taken = self.taken(cosine, self.table.knot)
-        return taken if self.reflects else np.ones_like(taken)
+    def lobe_factor(self, loss: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Factor of the lobe of the table for the loss of what is under it."""
+        return loss if self.reflects else np.ones_like(loss)
 
 
-def _of_coat(cosine: np.ndarray, knot: np.ndarray) -> np.ndarray:
+def _coat_loss(cosine: np.ndarray, knot: np.ndarray) -> np.ndarray:
     return np.broadcast_to(coat_reflectance(cosine), (len(knot), len(cosine)))
 
 
-def _of_sheen(cosine: np.ndarray, knot: np.ndarray) -> np.ndarray:
+def _sheen_loss(cosine: np.ndarray, knot: np.ndarray) -> np.ndarray:
     return sheen_albedo(cosine, np.exp(knot)[:, None])
 
 
 _LAYERS = {
-    "clear coat": _Layer(_UNDER_COAT, METALLIC_ROUGHNESS, _MIRROR, _of_coat, reflects=True),
-    "sheen": _Layer(_UNDER_SHEEN, SHEEN, 0, _of_sheen, reflects=False),
+    "clear coat": _Layer(_UNDER_COAT, METALLIC_ROUGHNESS, _MIRROR, _coat_loss, reflects=True),
+    "sheen": _Layer(_UNDER_SHEEN, SHEEN, 0, _sheen_loss, reflects=False),
 }
 
 
@@ -89,9 +88,9 @@ class LayeredFamily(eqx.Module):
         """The BRDF for the natural logarithms of both roughnesses."""
         base, roughness = MetallicRoughness(roughness=jnp.exp(log_roughness)).terms(), jnp.exp(log_layer)
         if self.coat:
-            under = tuple(CoatedModel(each, transmits=True) for each in base)
+            under = tuple(CoatedModel(model, transmits=True) for model in base)
             return Channels((*base, *under, CoatedModel(GGX(1.0, roughness), transmits=False)), self.scale)
-        return Channels((*base, *(UnderSheen(each, roughness) for each in base), Charlie(roughness)), self.scale)
+        return Channels((*base, *(UnderSheen(model, roughness) for model in base), Charlie(roughness)), self.scale)
 
 
 @dataclass(frozen=True)
@@ -182,10 +181,10 @@ class LayeredTable(StandardTable):
     ) -> list[tuple[StandardTable, float, np.ndarray]]:
         """The tables of base and layer, the logarithm of the roughness of each, and mean weights of their channels."""
         weight, layer = np.asarray(weight, np.float64), self.layer
-        taken = layer.taken(_VIEWS, np.array([log_roughness[1]])).mean()
+        loss = layer.loss(_VIEWS, np.array([log_roughness[1]])).mean()
         above = np.zeros(len(layer.table.scale))
-        above[layer.channel] = weight[-1] * (taken if layer.reflects else 1)
-        base = weight[:BASE] + (1 - taken) * weight[BASE : 2 * BASE]
+        above[layer.channel] = weight[-1] * layer.lobe_factor(loss)
+        base = weight[:BASE] + (1 - loss) * weight[BASE : 2 * BASE]
         return [(METALLIC_ROUGHNESS, log_roughness[0], base), (layer.table, log_roughness[1], above)]
 
     @property
@@ -210,10 +209,10 @@ def _over(base: Any, layer: Any, axis: int) -> np.ndarray:
     return np.concatenate([rows, np.broadcast_to(layer[..., None, :, :], (*layer.shape[:-2], *shape))], axis)
 
 
-def _under(base: Any, layer: Any, taken: np.ndarray) -> np.ndarray:
+def _under(base: Any, layer: Any, loss: np.ndarray) -> np.ndarray:
     """Channels [k ... n v] of the base, these under a full layer, and that of the layer [1 ... m v]."""
     whole = _over(base, layer, 0)
-    return np.concatenate([whole[:-1], whole[:-1] * (1 - taken), whole[-1:]])
+    return np.concatenate([whole[:-1], whole[:-1] * (1 - loss), whole[-1:]])
 
 
 @functools.cache
@@ -226,66 +225,67 @@ def _tensor(over: str, count: int, ranks: tuple[int, int, int] | None, dtype: An
     layer = _LAYERS[over]
     base = METALLIC_ROUGHNESS.tensor(count, ranks)
     lobes, factor = _layered_lobes(layer, base.lobe, layer.table.lobes(count), dtype), np.asarray(base.factor)
-    taken = layer.taken(_VIEWS, layer.table.knot).mean(1)[:, None, None]
-    shape = (len(factor), len(taken), *factor.shape[1:])
+    loss = layer.loss(_VIEWS, layer.table.knot).mean(1)[:, None, None]
+    shape = (len(factor), len(loss), *factor.shape[1:])
     rows = np.broadcast_to(factor[:, None], shape)
     none = np.zeros_like(rows[:, :, :1])
-    whole = tables.constant(np.concatenate([rows, rows * (1 - taken), none], 2), dtype=dtype)
+    whole = tables.constant(np.concatenate([rows, rows * (1 - loss), none], 2), dtype=dtype)
     return DynamicBrdf(lobes, base.core, whole, base.view_map, base.light_map, base.error)
 
 
-def _layered_lobes(layer: _Layer, base: LobeBrdf, own: LobeBrdf, dtype: Any) -> LobeBrdf:
+def _layered_lobes(layer: _Layer, base: LobeBrdf, top: LobeBrdf, dtype: Any) -> LobeBrdf:
     """The lobes of the base, and those of the layer."""
     cosine = _cosine(np.linspace(0, 1, base.scale.shape[-1]))
-    taken, sent = layer.taken(cosine, layer.table.knot), layer.sent(cosine)
-    strength, matte = (np.asarray(each)[[layer.channel]] * sent for each in (own.weight, own.diffuse))
+    loss = layer.loss(cosine, layer.table.knot)
+    rows = (np.asarray(row)[[layer.channel]] for row in (top.weight, top.diffuse))
+    strength, matte = (row * layer.lobe_factor(loss) for row in rows)
     # Lobes of the base have no weight in the channel of the layer, and its lobes none in those of the base.
     weight = np.concatenate(
         [
-            _under(base.weight, 0 * strength, taken),
-            _under(np.zeros((BASE, *own.scale.shape[:1], *base.scale.shape[1:])), strength, taken),
+            _under(base.weight, 0 * strength, loss),
+            _under(np.zeros((BASE, *top.scale.shape[:1], *base.scale.shape[1:])), strength, loss),
         ],
         1,
     )
     arrays = (
-        _over(base.mean, own.mean, 1),
-        _over(base.scale, own.scale, 0),
+        _over(base.mean, top.mean, 1),
+        _over(base.scale, top.scale, 0),
         weight,
-        _under(base.diffuse, matte, taken),
+        _under(base.diffuse, matte, loss),
     )
-    mean, scale, weight, diffuse = (tables.constant(each, dtype=dtype) for each in arrays)
-    return LobeBrdf(mean, scale, weight, diffuse, (base.knot[0], own.knot[0]), jnp.maximum(base.error, own.error))
+    mean, scale, weight, diffuse = (tables.constant(array, dtype=dtype) for array in arrays)
+    return LobeBrdf(mean, scale, weight, diffuse, (base.knot[0], top.knot[0]), jnp.maximum(base.error, top.error))
 
 
 @functools.cache
 def _harmonics(over: str, degree: int, dtype: Any) -> HarmonicBrdf:
     layer = _LAYERS[over]
-    base, own = METALLIC_ROUGHNESS.harmonics(degree), layer.table.harmonics(degree)
-    cosine, knot = _cosine(np.arange(base.table.shape[-1]) / base.steps), np.asarray(own.knot[0], np.float64)
-    taken = layer.taken(cosine, knot)
-    lobe = np.asarray(own.table)[:, [layer.channel]] * (taken if layer.reflects else 1)
-    channels = _under(np.moveaxis(np.asarray(base.table), 1, 0), np.moveaxis(lobe, 1, 0), taken)
+    base, top = METALLIC_ROUGHNESS.harmonics(degree), layer.table.harmonics(degree)
+    cosine, knot = _cosine(np.arange(base.table.shape[-1]) / base.steps), np.asarray(top.knot[0], np.float64)
+    loss = layer.loss(cosine, knot)
+    lobe = np.asarray(top.table)[:, [layer.channel]] * layer.lobe_factor(loss)
+    channels = _under(np.moveaxis(np.asarray(base.table), 1, 0), np.moveaxis(lobe, 1, 0), loss)
     return HarmonicBrdf(
         tables.constant(np.moveaxis(channels, 0, 1), dtype=dtype),
-        (base.knot[0], own.knot[0]),
-        jnp.maximum(base.error, own.error),
+        (base.knot[0], top.knot[0]),
+        jnp.maximum(base.error, top.error),
     )
 
 
 @functools.cache
 def _paths(over: str, dtype: Any) -> tuple[SeparableBrdf, FunctionWeights]:
     layer = _LAYERS[over]
-    brdf, sent = METALLIC_ROUGHNESS.paths()
-    factor, knot = np.asarray(sent.factor), layer.table.knot
-    taken = layer.taken(_VIEWS, knot).mean(1)
+    brdf, path = METALLIC_ROUGHNESS.paths()
+    factor, knot = np.asarray(path.factor), layer.table.knot
+    loss = layer.loss(_VIEWS, knot).mean(1)
     if layer.reflects:
-        own = factor[:, layer.channel] * taken[:, None]
+        row = factor[:, layer.channel] * loss[:, None]
     else:
-        own = factor[0, _WHITE] / METALLIC_ROUGHNESS.scale[_WHITE] * taken[:, None]
+        row = factor[0, _WHITE] / METALLIC_ROUGHNESS.scale[_WHITE] * loss[:, None]
     shape = (len(factor), len(knot))
     base = np.broadcast_to(factor[:, None], (*shape, *factor.shape[1:]))
-    layers = np.broadcast_to(own[:, None], (*shape, 1, factor.shape[2]))
-    whole = np.concatenate([base, base * (1 - taken[:, None, None]), layers], 2)
+    layers = np.broadcast_to(row[:, None], (*shape, 1, factor.shape[2]))
+    whole = np.concatenate([base, base * (1 - loss[:, None, None]), layers], 2)
     return brdf, FunctionWeights(
-        (sent.knot[0], tables.constant(knot, dtype=dtype)), tables.constant(whole, dtype=dtype)
+        (path.knot[0], tables.constant(knot, dtype=dtype)), tables.constant(whole, dtype=dtype)
     )

@@ -226,8 +226,8 @@ def path(name: str) -> pathlib.Path:
 
 def forget() -> None:
     """Forgets the tables of this process, so that the next use reads them again."""
-    for each in (_read, _lobes, _tensor, _harmonics, _paths):
-        each.cache_clear()
+    for reader in (_read, _lobes, _tensor, _harmonics, _paths):
+        reader.cache_clear()
 
 
 @functools.cache
@@ -243,7 +243,7 @@ def _lobes(table: StandardTable, count: int, dtype: Any) -> LobeBrdf:
             return lobe.tabulate(table.family, lobes=count, knot=(np.asarray(table._stored["knot"]),))
     stored = {name: table._stored[f"lobes{count}.{name}"] for name in ("scale", "weight", "diffuse")}
     mean = table._stored[f"lobes{count}.mean"].astype(np.float64) / UNIT
-    scale, weight, diffuse = (constant(each, dtype=dtype) for each in stored.values())
+    scale, weight, diffuse = (constant(value, dtype=dtype) for value in stored.values())
     knot, error = (
         constant(table._stored["knot"], dtype=dtype),
         constant(np.asarray(np.max(table.errors(count))), dtype=dtype),
@@ -259,11 +259,11 @@ def _tensor(table: StandardTable, lobes: int, ranks: tuple[int, int, int] | None
             return dynamic.tabulate(table.family, lobes=table.lobes(lobes) if lobes else 0, ranks=ranks, knot=knot)
     if ranks is None:
         return dynamic.table.without_tensor(table.lobes(lobes))
-    held = table.lobes(lobes)
-    diffuse = constant(np.asarray(held.diffuse) + table._stored["tensor.diffuse"], dtype=dtype)
+    brdf = table.lobes(lobes)
+    diffuse = constant(np.asarray(brdf.diffuse) + table._stored["tensor.diffuse"], dtype=dtype)
     names = "core", "factor", "view", "light", "error"
     rows = (constant(table._stored[f"tensor.{name}"], dtype=dtype) for name in names)
-    return DynamicBrdf(dataclasses.replace(held, diffuse=diffuse), *rows)
+    return DynamicBrdf(dataclasses.replace(brdf, diffuse=diffuse), *rows)
 
 
 @functools.cache
