@@ -52,7 +52,7 @@ class SceneLamps(eqx.Module):
         order = np.argsort(np.concatenate([vertex for vertex, _ in groups]))
 
         def column(name: str, axis: int) -> np.ndarray:
-            rows = [np.take(np.asarray(getattr(own, name)), np.arange(len(vertex)), axis) for vertex, own in groups]
+            rows = [np.take(np.asarray(getattr(to, name)), np.arange(len(vertex)), axis) for vertex, to in groups]
             return np.take(np.concatenate(rows, axis), order, axis)
 
         solid, cosine, direction = (column(name, -1) for name in ("solid_angle", "cosine", "direction"))
@@ -67,9 +67,9 @@ class SceneLamps(eqx.Module):
             changed: Point lights with other intensities, by name.
         """
         rows: list[Any] = [
-            _mean(own, appearances[number].emitted) for number, own in zip(self.emitting, self.area, strict=True)
+            _mean(area, appearances[number].emitted) for number, area in zip(self.emitting, self.area, strict=True)
         ]
-        rows += [changed.get(each.name, each).intensity for each in self.point_lights]
+        rows += [changed.get(light.name, light).intensity for light in self.point_lights]
         return jax.device_put(np.stack(rows)) if known(rows) else jnp.stack(rows)
 
     def sources(
@@ -82,12 +82,12 @@ class SceneLamps(eqx.Module):
             origin: The origin.
         """
         lights = tuple(
-            dataclasses.replace(each, position=origins.local(f"point light {each.name!r}", each.position, origin))
-            for each in self.point_lights
+            dataclasses.replace(light, position=origins.local(f"point light {light.name!r}", light.position, origin))
+            for light in self.point_lights
         )
         radiance = self.radiance(appearances, {})
         xp = np if known(radiance, self.area) else jnp
-        surface = [np.pi * xp.sum(xp.asarray(own)) for own in self.area]
+        surface = [np.pi * xp.sum(xp.asarray(area)) for area in self.area]
         return lights, xp.asarray([*surface, *(4 * np.pi for _ in lights)]) * xp.mean(xp.asarray(radiance), -1)
 
 
@@ -117,15 +117,14 @@ def make(
         targets: For each group, what casts shadows, and where and how to compute.
         point_lights: The point lights of the scene, in the coordinates of its file.
     """
-    emitting = [number for number, each in enumerate(shadings) if each.emitted is not None]
+    emitting = [number for number, shading in enumerate(shadings) if shading.emitted is not None]
     if not emitting and not scene.point_lights:
         return None
     sources = [*(shadings[number].mesh for number in emitting), *scene.point_lights]
     groups = []
     for members, size, system, target in zip(place.parts, place.size, systems, targets, strict=True):
         shading, mesh = shadings[members[0]], joined_mesh([shadings[part] for part in members])
-        options = target.traced("lamps")
-        transport = axes.joined([lamps.precompute(mesh, sources, apart=True, **options)], size=size)
+        transport = axes.pad(lamps.precompute(mesh, sources, apart=True, **target.traced("lamps")), size)
         if shading.matte:
             groups.append(LitByLamps(transport, albedo=shading.albedo))
         else:
@@ -142,18 +141,18 @@ def split(lamp: SceneLamps | None, materials: Any) -> tuple[Any, dict[str, Point
     """
     if not isinstance(materials, Mapping):
         return materials, {}
-    given = dict(materials)
-    changed = {name: given.pop(name) for name, each in list(given.items()) if isinstance(each, PointLight)}
-    known = {} if lamp is None else {each.name: each for each in lamp.point_lights}
-    for name, each in changed.items():
+    changed = {name: value for name, value in materials.items() if isinstance(value, PointLight)}
+    of_parts = {name: value for name, value in materials.items() if name not in changed}
+    known = {} if lamp is None else {light.name: light for light in lamp.point_lights}
+    for name, light in changed.items():
         if name not in known:
             raise ValueError(f"point lights must be among those of the scene, {list(known)}, got one named {name!r}")
-        now, then = each.position, known[name].position
+        now, then = light.position, known[name].position
         if isinstance(now, Tracer) or isinstance(then, Tracer):
             continue
         if not np.array_equal(np.asarray(now), np.asarray(then)):
             raise ValueError(
                 f"point light {name!r} was traced from {np.asarray(known[name].position).tolist()}, got one at "
-                f"{np.asarray(each.position).tolist()}: precompute the scene with it there"
+                f"{np.asarray(light.position).tolist()}: precompute the scene with it there"
             )
-    return given, changed
+    return of_parts, changed

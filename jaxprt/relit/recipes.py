@@ -124,7 +124,7 @@ class Recipe(eqx.Module):
 
 def padded(transport: T, vertices: int | None) -> T:
     """Transport padded to a number of vertices."""
-    return transport if vertices is None else axes.joined([transport], size=vertices)
+    return transport if vertices is None else axes.pad(transport, vertices)
 
 
 class Lobes(Recipe):

@@ -686,7 +686,7 @@ class RelitScene(System):
         if part not in range(len(self.shading)):
             raise ValueError(f"part must be the index of one of {len(self.shading)} parts, got {part!r}")
         first = int(self.place.start[part])
-        return axes.taken(self.surfaces[self.place.group[part]].system, slice(first, first + self.place.counts[part]))
+        return axes.take(self.surfaces[self.place.group[part]].system, slice(first, first + self.place.counts[part]))
 
     def _all(self, appearances: Mapping[str, Appearance]) -> list[Appearance]:
         """The appearance of each part: the given one, or that of the material it was precomputed with."""

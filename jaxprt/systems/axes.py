@@ -1,15 +1,15 @@
-"""Axes of arrays, named by the type annotations of their fields, to join, pad and cut what has vertices."""
+"""Axes of arrays, named by the type annotations of their fields, to pad and cut what has vertices."""
 
 import dataclasses
 import typing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
 from jaxtyping import PyTree
 
-Held = TypeVar("Held", bound=PyTree)
+Value = TypeVar("Value", bound=PyTree)
 
 
 def leaves(value: PyTree) -> Iterator[tuple[list[str], Any]]:
@@ -26,7 +26,7 @@ def leaves(value: PyTree) -> Iterator[tuple[list[str], Any]]:
         node: Any = value
         for key in path:
             if isinstance(key, jax.tree_util.GetAttrKey) and dataclasses.is_dataclass(node):
-                hint = {each.name: each.type for each in dataclasses.fields(node)}[key.name]
+                hint = {field.name: field.type for field in dataclasses.fields(node)}[key.name]
                 node = getattr(node, key.name)
             elif isinstance(key, jax.tree_util.SequenceKey):
                 node = node[key.idx]
@@ -38,41 +38,31 @@ def leaves(value: PyTree) -> Iterator[tuple[list[str], Any]]:
         yield _names(hint, leaf), leaf
 
 
-def joined(values: Sequence[Held], *, size: int) -> Held:  # pyright: ignore[reportInvalidTypeForm]
-    """Transport of several meshes as that of one, with the vertices of one mesh after another.
+def pad(value: Value, size: int) -> Value:  # pyright: ignore[reportInvalidTypeForm]
+    """Transport with `size` vertices, of which those after its own repeat the last one."""
 
-    Arrays without an axis of vertices are those of the first.
+    def longer(axes: list[str], leaf: Any) -> Any:
+        if "v" not in axes:
+            return leaf
+        after = [size - length if name == "v" else 0 for name, length in zip(axes, leaf.shape, strict=True)]
+        return jax.device_put(np.pad(np.asarray(leaf), [(0, count) for count in after], mode="edge"))
 
-    Args:
-        values: Transport of each mesh, all of one kind.
-        size: Number of vertices of the result. Vertices after those of all meshes repeat the last one.
-    """
-    every = [list(leaves(value)) for value in values]
-    made: dict[int, Any] = {}  # An array that occurs twice stays one array.
-    result = []
-    for number, (axes, leaf) in enumerate(every[0]):
-        if "v" in axes and id(leaf) not in made:
-            axis = axes.index("v")
-            whole = np.concatenate([np.asarray(own[number][1]) for own in every], axis)
-            room = [(0, size - whole.shape[axis] if each == axis else 0) for each in range(whole.ndim)]
-            made[id(leaf)] = jax.device_put(np.pad(whole, room, mode="edge"))
-        result.append(made.get(id(leaf), leaf))
-    return jax.tree.unflatten(jax.tree.structure(values[0]), result)
+    return map_leaves(value, longer)
 
 
-def taken(value: Held, vertex: slice) -> Held:  # pyright: ignore[reportInvalidTypeForm]
+def take(value: Value, vertex: slice) -> Value:  # pyright: ignore[reportInvalidTypeForm]
     """Transport or a system at some of its vertices, in NumPy."""
-    return mapped(value, lambda axes, leaf: np.asarray(leaf)[_at(axes, vertex)] if "v" in axes else leaf)
+    return map_leaves(value, lambda axes, leaf: np.asarray(leaf)[_at(axes, vertex)] if "v" in axes else leaf)
 
 
-def mapped(value: Held, change: Callable[[list[str], Any], Any]) -> Held:  # pyright: ignore[reportInvalidTypeForm]
+def map_leaves(value: Value, change: Callable[[list[str], Any], Any]) -> Value:  # pyright: ignore[reportInvalidTypeForm]
     """The value with each array changed by a function of the names of its axes and the array."""
-    made: dict[int, Any] = {}
-    every = list(leaves(value))
-    for axes, leaf in every:
-        if id(leaf) not in made:
-            made[id(leaf)] = change(axes, leaf)
-    return jax.tree.unflatten(jax.tree.structure(value), [made[id(leaf)] for _, leaf in every])
+    rows = list(leaves(value))
+    changed: dict[int, Any] = {}  # An array that occurs twice stays one array.
+    for axes, leaf in rows:
+        if id(leaf) not in changed:
+            changed[id(leaf)] = change(axes, leaf)
+    return jax.tree.unflatten(jax.tree.structure(value), [changed[id(leaf)] for _, leaf in rows])
 
 
 def _at(axes: list[str], vertex: slice) -> tuple[slice, ...]:
@@ -86,4 +76,4 @@ def _names(hint: Any, leaf: Any) -> list[str]:
     names = getattr(hint, "dim_str", "").split()
     if names and len(names) == leaf.ndim:
         return names
-    return next((found for each in typing.get_args(hint) if (found := _names(each, leaf))), [])
+    return next(filter(None, (_names(part, leaf) for part in typing.get_args(hint))), [])

@@ -18,11 +18,11 @@ from jaxtyping import Array, Float, PyTree
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points
 from jaxprt.systems import protocol
-from jaxprt.systems.axes import leaves
+from jaxprt.systems.axes import leaves, map_leaves
 from jaxprt.systems.protocol import Blend, System, VertexSystem
 from jaxprt.visibility.rays import BLOCK
 
-Laid = TypeVar("Laid", bound=PyTree)
+Value = TypeVar("Value", bound=PyTree)
 
 _AXES = "v", "block", "p", "g"  # vertices, blocks of them, clusters of them
 
@@ -78,7 +78,7 @@ class Padded(System):
         return _padded(materials, self.count, self.system.vertices)
 
 
-def shard(value: Laid, devices: Sequence[jax.Device]) -> Laid:  # pyright: ignore[reportInvalidTypeForm]
+def shard(value: Value, devices: Sequence[jax.Device]) -> Value:  # pyright: ignore[reportInvalidTypeForm]
     """Shards a transport, a system or a scene over devices, each of which gets an equal share of the vertices.
 
     For example `scene = jaxprt.shard(scene, jax.devices())`. Light, views, radiance, pictures and gradients are then
@@ -103,22 +103,17 @@ def shard(value: Laid, devices: Sequence[jax.Device]) -> Laid:  # pyright: ignor
         raise TypeError(
             f"value must be a transport, system or scene of jaxprt, which have vertices, got {type(value).__name__}"
         )
-    even = jax.tree.map(lambda each: _even(each, across.size), value, is_leaf=lambda x: isinstance(x, VertexSystem))
+    even = jax.tree.map(lambda part: _even(part, across.size), value, is_leaf=lambda x: isinstance(x, VertexSystem))
     if not isinstance(value, System):
         _check_shares(value, across.size)
-    made: dict[int, Any] = {}  # An array that occurs twice stays one array.
-    every = list(leaves(even))
-    for axes, leaf in every:
-        if id(leaf) not in made:
-            made[id(leaf)] = _put(axes, leaf, across)
-    return jax.tree.unflatten(jax.tree.structure(even), [made[id(leaf)] for _, leaf in every])
+    return map_leaves(even, lambda axes, leaf: _put(axes, leaf, across))
 
 
 def _mesh(devices: Any) -> jax.sharding.Mesh:
-    each = list(devices) if isinstance(devices, Sequence | np.ndarray) else [devices]
-    if not each or not all(isinstance(one, jax.Device) for one in each) or len(set(each)) < len(each):
+    row = list(devices) if isinstance(devices, Sequence | np.ndarray) else [devices]
+    if not row or not all(isinstance(device, jax.Device) for device in row) or len(set(row)) < len(row):
         raise ValueError(f"the devices must be one or more of {jax.devices()}, each at most once, got {devices}")
-    return jax.sharding.Mesh(np.array(each), ("vertex",))
+    return jax.sharding.Mesh(np.array(row), ("vertex",))
 
 
 def _even(value: Any, shares: int) -> Any:
@@ -130,16 +125,16 @@ def _even(value: Any, shares: int) -> Any:
     return value if count % step == 0 else Padded(_padded(value, count, count + -count % step), count)
 
 
-def _padded(value: Laid, count: int, size: int) -> Laid:
+def _padded(value: Value, count: int, size: int) -> Value:
     """Pads the arrays of `count` vertices to `size` by repeating the last vertex."""
 
     def longer(axes: list[str], leaf: Any) -> Any:
         for name, before, after in (("v", count, size), ("block", -(-count // BLOCK), -(-size // BLOCK))):
             if name in axes and leaf.shape[axes.index(name)] == before:
-                return jnp.pad(leaf, [(0, after - before if each == name else 0) for each in axes], mode="edge")
+                return jnp.pad(leaf, [(0, after - before if axis == name else 0) for axis in axes], mode="edge")
         return leaf
 
-    return jax.tree.unflatten(jax.tree.structure(value), [longer(*each) for each in leaves(value)])
+    return map_leaves(value, longer)
 
 
 def _check_shares(value: PyTree, shares: int) -> None:

@@ -8,7 +8,7 @@ import jax
 from jaxtyping import PyTree
 
 from jaxprt.scene.mesh import Mesh
-from jaxprt.systems.axes import leaves
+from jaxprt.systems.axes import leaves, map_leaves
 from jaxprt.systems.protocol import System, VertexSystem
 from jaxprt.systems.separable import SparseTransport
 from jaxprt.visibility.rays import BLOCK
@@ -45,19 +45,18 @@ def take(value: Piece, start: int, stop: int) -> Piece:
         raise TypeError(f"value must be a system of one mesh, such as RelitScene.part_system(0), got {_kind(value)}")
     if isinstance(value, VertexSystem) and value.points is not None:
         raise TypeError(f"value must be a system at vertices, got {_kind(value)} at points")
-    value = jax.tree.map(_bare, value, is_leaf=lambda each: isinstance(each, SparseTransport))
-    every = list(leaves(value))
-    counts = {leaf.shape[axes.index("v")] for axes, leaf in every if "v" in axes}
+    value = jax.tree.map(_bare, value, is_leaf=lambda part: isinstance(part, SparseTransport))
+    rows = list(leaves(value))
+    counts = {leaf.shape[axes.index("v")] for axes, leaf in rows if "v" in axes}
     if isinstance(value, Mesh) or len(counts) != 1:
         raise TypeError(f"value must be a transport or a system with vertices, got {_kind(value)}")
-    if any("p" in axes or "g" in axes for axes, _ in every):
+    if any("p" in axes or "g" in axes for axes, _ in rows):
         raise TypeError(f"value must have no clusters, because a range would cut them, got a {_kind(value)}")
     if not 0 <= start < stop <= max(counts):
         raise ValueError(f"the range must be within {max(counts)} vertices, got {start} to {stop}")
-    if start % BLOCK and any("block" in axes for axes, _ in every):
+    if start % BLOCK and any("block" in axes for axes, _ in rows):
         raise ValueError(f"the range must begin at a multiple of {BLOCK} vertices, got {start}")
-    made = [_cut(axes, leaf, start, stop) for axes, leaf in every]
-    return jax.tree.unflatten(jax.tree.structure(value), made)
+    return map_leaves(value, lambda axes, leaf: _cut(axes, leaf, start, stop))
 
 
 def _kind(value: Any) -> str:
@@ -68,7 +67,7 @@ def _bare(value: Any) -> Any:
     """Drops the transpose of sparse transport, which refers to all vertices."""
     if not isinstance(value, SparseTransport):
         return value
-    return eqx.tree_at(lambda each: each.transpose, value, None, is_leaf=lambda each: each is None)
+    return eqx.tree_at(lambda transport: transport.transpose, value, None, is_leaf=lambda leaf: leaf is None)
 
 
 def _cut(axes: list[str], leaf: Any, start: int, stop: int) -> Any:

@@ -53,7 +53,7 @@ class PageScene:
             ValueError: A page cannot show the system of a part.
         """
         names = relit.scene.names
-        systems = [axes.mapped(relit.part_system(n), lambda _, leaf: put(leaf)) for n in range(len(names))]
+        systems = [axes.map_leaves(relit.part_system(n), lambda _, leaf: put(leaf)) for n in range(len(names))]
         parts = [system.exported(f"part {name!r}") for name, system in zip(names, systems, strict=True)]
         pairs = zip(systems, parts, strict=True)
         texels = [None if part.degree is not None else system.texel_visibility for system, part in pairs]
