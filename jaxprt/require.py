@@ -136,24 +136,24 @@ def at_least(name: str, value: Any, least: float, *, slack: float = 0.0) -> None
         _require(name, f"at least {least:g}", known, np.asarray(known >= least - slack))
 
 
-def position(name: str, value: Any, *, each: int | None = None) -> Array:
+def position(name: str, value: Any, *, points: int | None = None) -> Array:
     """Refuses values that are not a finite position. The shape is checked inside `jax.jit` too.
 
     Args:
         name: Description of the value for the message, such as "the eye".
         value: An array or a list.
-        each: Number of points if the value may be one position for each point; None if it must be a single position.
+        points: Number of points if the value may be one position for each point; None if it must be a single position.
 
     Returns:
         The position as an array of floating point.
 
     Raises:
         TypeError: The value does not consist of real numbers.
-        ValueError: The shape is neither [3] nor, with `each`, [each 3], or some values are not finite.
+        ValueError: The shape is neither [3] nor, with `points`, [points 3], or some values are not finite.
     """
     real(name, value)
     shape = np.shape(_array_of(value))
-    if shape not in ((3,), (each, 3)):
+    if shape not in ((3,), (points, 3)):
         raise ValueError(f"{name} must be one position, [3], got an array of shape {list(shape)}")
     finite(name, value)
     return floating(value)

@@ -856,7 +856,7 @@ EXAMPLES = {
     "systems.bright_texels.without": example(
         lambda draw: call(draw.light(), draw.integer(96, 5), least=draw.array(0.0)), rank=20, gradient=()
     ),
-    "systems.lamps.relight.summed": example(lambda draw: call(draw.uniform(2, 3), draw.normal(2, 4, 3))),
+    "systems.lamps.relight.combine": example(lambda draw: call(draw.uniform(2, 3), draw.normal(2, 4, 3))),
     "systems.bright_texels.irradiance": example(
         lambda draw: call(draw.direct(), draw.integer(96, 5), draw.uniform(5, 3)), gradient=("excess",)
     ),
@@ -899,10 +899,10 @@ EXAMPLES = {
     "systems.lobe.table.traced_share": example(lambda draw: call(10 + 10 * draw.uniform(5))),
     "systems.bounces.relight.area_mean": example(lambda draw: call(draw.normal(5, 2, 3), draw.uniform(5))),
     "systems.bounces.gather.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
-    "systems.lamps.relight.beside": example(
+    "systems.lamps.relight.ray_share": example(
         lambda draw: call(draw.uniform(5, low=2, high=90), draw.uniform(5, low=0.05, high=0.5))
     ),
-    "systems.lamps.relight.met": example(
+    "systems.lamps.relight.mean_density": example(
         lambda draw: call(
             jnp.moveaxis(jnp.stack([draw.unit(4), draw.unit(4)]), -1, 0),
             draw.uniform(2, 4, low=0.5, high=90),

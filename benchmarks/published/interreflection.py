@@ -62,11 +62,11 @@ def interreflect(
     """
     check(harmonics.degree_of(transport.matrix.shape[-1]), size)
     _check(mesh, len(transport.position), len(brdf), bounces)
-    wrong = [each.degree for each in brdf if each.table.shape[0] != transport.matrix.shape[-1] or each.knot]
+    wrong = [model.degree for model in brdf if model.table.shape[0] != transport.matrix.shape[-1] or model.knot]
     if wrong:
         degree = harmonics.degree_of(transport.matrix.shape[-1])
         raise ValueError(f"BRDFs must have the transport's degree {degree} and no parameters, got degrees {wrong}")
-    colors = max(transport.matrix.shape[1], *(each.table.shape[1] for each in brdf))
+    colors = max(transport.matrix.shape[1], *(model.table.shape[1] for model in brdf))
     check_memory(len(transport.matrix), harmonics.degree_of(transport.matrix.shape[-1]), copies=2, colors=colors)
     shape = (len(transport.matrix), colors, *transport.matrix.shape[2:])
     total = last = np.broadcast_to(np.asarray(transport.matrix), shape)
@@ -138,8 +138,8 @@ def _shade(
         vertex, weight = corner[:, k], barycentric[:, k]
         wo = jnp.sum(frame[vertex] * -direction[:, None], -1)
         view = sum(
-            jnp.where(region[vertex] == number, each.coefficients(wo), 0).swapaxes(0, 2)
-            for number, each in enumerate(brdf)
+            jnp.where(region[vertex] == number, model.coefficients(wo), 0).swapaxes(0, 2)
+            for number, model in enumerate(brdf)
         )
         view = jnp.broadcast_to(view, (len(wo), *rows.shape[1:3])) * weight[:, None, None]
         return total + jnp.einsum("mlo,mloi->mli", view, rows[vertex]), None
@@ -180,7 +180,7 @@ class _BounceJob(visibility.rays.VisibilityJob):
 
     @property
     def near(self) -> Mapping[str, list[float]]:
-        tables = {f"brdf {number}": sketch(each.table) for number, each in enumerate(self.brdf)}
+        tables = {f"brdf {number}": sketch(model.table) for number, model in enumerate(self.brdf)}
         return {**super().near, "rows": sketch(self.rows), **tables}
 
     @property

@@ -38,7 +38,7 @@ class Mixture(eqx.Module):
         return jnp.sum(self.weight * jnp.exp(log_density(direction, self.mean, self.concentration)), -1)
 
 
-class Fit(eqx.Module):
+class MixtureFit(eqx.Module):
     """The result of `fit`.
 
     Attributes:
@@ -139,7 +139,7 @@ def fit(
     least: Float[Array, "*l"] | float = 1e-3,
     most: Float[Array, ""] | float = 1e6,
     steps: int = 50,
-) -> Fit:
+) -> MixtureFit:
     """Fits von Mises-Fisher lobes and the weights of fixed densities to weighted samples.
 
     The components together have the total mass of the samples. A component to which no sample belongs keeps its shape
@@ -199,7 +199,7 @@ def fit(
     (share, mean, concentration, _), (likelihood, residual) = jax.lax.scan(step, carry, None, length=steps)
     share = share * total
     likelihood = jnp.concatenate([first[None], likelihood])
-    return Fit(Mixture(share[:count], mean, concentration), share[count:], likelihood, residual)
+    return MixtureFit(Mixture(share[:count], mean, concentration), share[count:], likelihood, residual)
 
 
 @partial(jit, static_argnames=("steps",))

@@ -31,7 +31,7 @@ from jaxprt.scene import Mesh
 from jaxprt.scene.points import Points
 from jaxprt.systems.bounces import ReflectingPart
 from jaxprt.systems.lamps import LampTransport
-from jaxprt.systems.lamps.relight import beside
+from jaxprt.systems.lamps.relight import ray_share
 from jaxprt.systems.protocol import Blend
 
 _MOST_RAYS = 1 << 12  # of each vertex or point
@@ -182,7 +182,7 @@ def _lamps(
 
 @jit
 def _seen_lamps(chord: Array, hits_lamp: Array, weight: Array, concentration: Array) -> Float[Array, "n v c"]:
-    share = beside(concentration, chord[:, None]) * hits_lamp
+    share = ray_share(concentration, chord[:, None]) * hits_lamp
     return jnp.einsum("njv,jvc->nvc", share, weight, precision="highest")
 
 

@@ -75,10 +75,10 @@ def value(brdf: Callable, wi: Float[Array, "*b 3"], wo: Float[Array, "... 3"]) -
         ValueError: The BRDF does not return one row for each pair.
     """
     wo = jnp.broadcast_to(wo, wi.shape).reshape(-1, 3)
-    found = brdf(wi.reshape(-1, 3), wo)
-    if jnp.ndim(found) != 2 or found.shape[0] != len(wo):
-        raise ValueError(f"the BRDF must return [{len(wo)}, c] for {len(wo)} directions, got {list(jnp.shape(found))}")
-    return found.reshape(*wi.shape[:-1], -1)
+    color = brdf(wi.reshape(-1, 3), wo)
+    if jnp.ndim(color) != 2 or color.shape[0] != len(wo):
+        raise ValueError(f"the BRDF must return [{len(wo)}, c] for {len(wo)} directions, got {list(jnp.shape(color))}")
+    return color.reshape(*wi.shape[:-1], -1)
 
 
 def integrate(
@@ -94,7 +94,7 @@ def integrate(
         chosen: For each vertex and face, which of the m x m root cells to integrate.
         colors: Number of colors of the result.
     """
-    moving = [each for each in jax.tree.leaves(integrand) if _floating(each)]
+    moving = [leaf for leaf in jax.tree.leaves(integrand) if _floating(leaf)]
     return _total(colors, moving, jax.lax.stop_gradient((integrand, choice, chosen)))
 
 
@@ -116,8 +116,8 @@ def _(colors, primals, tangents):
     moving, fixed = primals
     tangent, restore = ravel_pytree(tangents[0])
 
-    def forward(given, tangent):
-        moving, fixed = given
+    def forward(arguments, tangent):
+        moving, fixed = arguments
         visit = _visit(fixed, colors)
 
         def add(total, cell):
@@ -126,8 +126,8 @@ def _(colors, primals, tangents):
 
         return _walk(add, jnp.zeros(shape, dtype), *fixed[1:])
 
-    def backward(given, cotangent):
-        moving, fixed = given
+    def backward(arguments, cotangent):
+        moving, fixed = arguments
         visit = _visit(fixed, colors)
 
         def add(total, cell):
@@ -189,14 +189,14 @@ def _deepest(size: int) -> int:
 def _visit(fixed: tuple, colors: int) -> Callable:
     """Makes the function (floating-point leaves of the integrand, cells) -> (sums of cells, children to subdivide)."""
     whole, choice, _ = fixed
-    leaf, tree = jax.tree.flatten(whole)
+    leaves, tree = jax.tree.flatten(whole)
     size = haar.face_edge(choice.seen.shape[1])
     deepest = _deepest(size)
     mean = jax.lax.stop_gradient(jnp.mean(whole.light, -1))
 
     def visit(moving, cell):
         left = iter(moving)
-        integrand = tree.unflatten([next(left) if _floating(each) else each for each in leaf])
+        integrand = tree.unflatten([next(left) if _floating(leaf) else leaf for leaf in leaves])
         vertex, level = cell[:, 0], cell[:, 1]
         wo = integrand.wo[vertex]
         wi, weight, texel = _nodes(cell, integrand.frame[vertex], size)
@@ -208,10 +208,10 @@ def _visit(fixed: tuple, colors: int) -> Callable:
         inner = _children(sent * (jnp.maximum(wi[2], 0) * weight)[..., None])
         clear = choice.seen[vertex[:, None, None], texel].astype(weight.dtype) / LEVELS
         scale = clear * brightest(mean[:, texel], choice.weight[vertex].T[:, :, None, None])
-        again = _again(jax.lax.stop_gradient((sent, wi, wo, weight, scale)), vertex, choice)
+        again = _is_rough(jax.lax.stop_gradient((sent, wi, wo, weight, scale)), vertex, choice)
         again &= ((level >= 0) & (level < deepest))[:, None, None]
-        kept = clear * ((level >= 0)[:, None, None] & ~again)
-        inner = jnp.broadcast_to(inner * kept[..., None], (*inner.shape[:-1], colors))
+        share = clear * ((level >= 0)[:, None, None] & ~again)
+        inner = jnp.broadcast_to(inner * share[..., None], (*inner.shape[:-1], colors))
         # One child at a time, because the compiler's loop for a sum over all of them takes ten times as long.
         light, child = integrand.light.swapaxes(0, 1), np.ndindex(SIDE, SIDE)
         return sum(light[texel[:, i, j]] * inner[:, i, j, None] for i, j in child), again
@@ -225,8 +225,8 @@ def brightest(light: Float[Array, "l *d"], weight: Float[Array, "l *#d"]) -> Flo
     Lights are processed one at a time, because the compiler's loop for a maximum over all lights is much slower.
     """
 
-    def step(most, each):
-        return jnp.maximum(most, each[0] * each[1]), None
+    def step(most, pair):
+        return jnp.maximum(most, pair[0] * pair[1]), None
 
     return jax.lax.scan(step, jnp.zeros(light.shape[1:], jnp.result_type(light, weight)), (light, weight))[0]
 
@@ -257,14 +257,14 @@ def _children(node: Array) -> Array:
     return jnp.sum(node.reshape(shape[0], SIDE, 2, SIDE, 2, *shape[3:]), (2, 4))
 
 
-def _again(given: tuple, vertex: Array, choice: Choice) -> Array:
+def _is_rough(samples: tuple, vertex: Array, choice: Choice) -> Array:
     """Whether each child has too large an error and must be subdivided.
 
     The error of two Gauss points is the fourth difference / 4320. It is estimated by the squared second difference
     divided by the value, to which it is proportional for a Gaussian lobe. The mirror direction serves as one more
     sample, to detect a peak between all other samples.
     """
-    sent, wi, wo, weight, scale = given
+    sent, wi, wo, weight, scale = samples
     gray = jax.lax.optimization_barrier(jnp.mean(sent, -1) * jnp.maximum(wi[2], 0) * weight)
     miss = jnp.zeros_like(gray)
     gap = jnp.where(jnp.arange(2 * SIDE - 1) % 2 == 0, _GAP, 1 - _GAP).astype(gray.dtype)

@@ -117,7 +117,7 @@ class BrightTexels(VertexSystem):
     def shade(self, light: BrightLight, materials: PyTree = None) -> BrightLight:
         """Light of the rest that arrives at the vertices, and the visibility of each bright texel."""
         rest = self.system.shade(light.rest, materials)
-        return BrightLight(rest, light.texel, light.excess, _seen(self.visibility, light.texel))
+        return BrightLight(rest, light.texel, light.excess, _sixteenths(self.visibility, light.texel))
 
     def tilted(self, light: BrightLight, normal: Float[Array, "v 3"]) -> BrightLight:
         """The light, whose rest is that of the underlying system: `System.tilted`."""
@@ -126,14 +126,14 @@ class BrightTexels(VertexSystem):
     def view(self, eye: Float[Array, "*p 3"], materials: PyTree = None) -> BrightView:
         """The view of the underlying system, and the frames and directions for which the bright texels are summed."""
         position, frame = self.place(self.visibility)
-        eye = require.position("the eye", eye, each=self.vertices)
+        eye = require.position("the eye", eye, points=self.vertices)
         return BrightView(self.system.view(eye, materials), frame, directions.view(frame, position, eye), materials)
 
     def combine(self, light: BrightLight, view: BrightView) -> Float[Array, "v c"]:
         """Radiance: the sum of that of the underlying system and that of the bright texels."""
         require.kind("the light", light, BrightLight, source="BrightTexels.light")
         require.kind("the view", view, BrightView, source="BrightTexels.view")
-        seen = _seen(self.visibility, light.texel) if light.seen is None else light.seen
+        seen = _sixteenths(self.visibility, light.texel) if light.seen is None else light.seen
         texels = light.texel, light.excess / LEVELS, seen
         options = {"size": self.visibility.size, "samples": self.samples}
         brdf = grid.as_argument(self.brdf)
@@ -143,7 +143,10 @@ class BrightTexels(VertexSystem):
     def at(self, points: Points) -> "BrightTexels":
         """The system at points; see `System.at`."""
         return eqx.tree_at(
-            lambda each: (each.points, each.system), self, (points, self.system.at(points)), is_leaf=lambda x: x is None
+            lambda bright: (bright.points, bright.system),
+            self,
+            (points, self.system.at(points)),
+            is_leaf=lambda x: x is None,
         )
 
     @property
@@ -262,9 +265,9 @@ def without(
     """The radiance taken out of given texels, and the rest of the environment: see `brightest`."""
     flux = _flux_of(light)
     level = flux[_largest(flux, min(rank + 1, len(flux)))[-1]]
-    own = flux[texel]
-    fraction = jnp.maximum(1 - level / jnp.where(own > 0, own, 1), 0)
-    fraction = jnp.where(own * fraction >= least * jnp.sum(flux), fraction, 0)
+    bright = flux[texel]
+    fraction = jnp.maximum(1 - level / jnp.where(bright > 0, bright, 1), 0)
+    fraction = jnp.where(bright * fraction >= least * jnp.sum(flux), fraction, 0)
     radiance = light.radiance.reshape(-1, light.radiance.shape[-1])
     excess = radiance[texel] * fraction[:, None].astype(radiance.dtype)
     return excess, Environment(radiance.at[texel].add(-excess).reshape(light.radiance.shape))
@@ -315,14 +318,14 @@ def radiance(
     require.count("samples", samples, least=-1, most=64)
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
-    excess = _checked(transport, texel, excess)
+    excess = _floating_excess(transport, texel, excess)
     eye = require.position("the eye", eye)
     wo = directions.view(transport.frame, transport.position, eye)
     light = texel, excess, transport.visible(texel)
     return sent(brdf, transport.frame, wo, light, None, blend, size=transport.size, samples=samples)
 
 
-def _checked(transport: Visibility, texel: Array, excess: Array) -> Array:
+def _floating_excess(transport: Visibility, texel: Array, excess: Array) -> Array:
     """Checks that texels and excess fit each other and the transport; returns the excess in floating point."""
     require.length("rows of the excess", excess, len(texel))
     require.finite("the excess", excess)
@@ -382,19 +385,19 @@ def sent(
 
     def point(argument):
         direction, area = argument
-        wi = jnp.stack([_along(axis, direction) for axis in frame])
-        cosine = jnp.maximum(_along(frame[2], area), 0)
+        wi = jnp.stack([_component(axis, direction) for axis in frame])
+        cosine = jnp.maximum(_component(frame[2], area), 0)
         if above is not None:
-            cosine = jnp.where(_along(above.T, direction) > 0, cosine, 0)
+            cosine = jnp.where(_component(above.T, direction) > 0, cosine, 0)
         return value(wi, wo, *parameter) * cosine
 
-    direction, area = (each.astype(excess.dtype) for each in _points(texel, size, samples, place))
+    direction, area = (row.astype(excess.dtype) for row in _points(texel, size, samples, place))
     # Texels are processed one by one, so that intermediate arrays stay in the processor's cache.
     return total(lit, (direction, area, excess, visible)).T
 
 
 @jit
-def _seen(visibility: Visibility, texel: Int[Array, " t"]) -> UInt8[Array, "t v"]:
+def _sixteenths(visibility: Visibility, texel: Int[Array, " t"]) -> UInt8[Array, "t v"]:
     """Visible share of each of the given texels for every vertex, in sixteenths."""
     return jnp.round(visibility.visible(texel) * LEVELS).astype(jnp.uint8)
 
@@ -433,7 +436,7 @@ def samples_for(brdf: Callable, *, size: int = 64, error: float = 0.02) -> int:
         axes = np.asarray(directions.frame(jnp.asarray(wo * [-1, -1, 1]), jnp.zeros(3)), np.float64)
         wi = s * axes[0] + t * axes[1] + axes[2]
         wi = (wi / np.linalg.norm(wi, axis=-1, keepdims=True)).reshape(-1, 3)
-        value = _value(brdf, *(jnp.asarray(each, jnp.result_type(float)) for each in (wi, wo)))
+        value = _value(brdf, *(jnp.asarray(row, jnp.result_type(float)) for row in (wi, wo)))
         sent = np.asarray(value, np.float64).mean(-1) * np.maximum(wi[:, 2], 0)
         mean = np.add.reduceat(sent.reshape(len(offset), -1) * weight, first, axis=1)
         off = np.linalg.norm(mean - mean[:, -1:], axis=0)
@@ -451,7 +454,7 @@ def irradiance(transport: Visibility, texel: Int[Array, " t"], excess: Float[Arr
         ValueError: A texel index is out of range, or the excess is not finite or does not have one row for each texel.
             Values cannot be checked inside `jax.jit`, where NaN reaches the vertices.
     """
-    return _irradiance(transport, texel, _checked(transport, texel, excess))
+    return _irradiance(transport, texel, _floating_excess(transport, texel, excess))
 
 
 @jit
@@ -463,7 +466,7 @@ def _irradiance(transport: Visibility, texel: Array, excess: Array) -> Array:
 def _points(texel: Int[Array, " t"], size: int, samples: int, spot: Float[Array, "t 4"] | None) -> tuple[Array, Array]:
     """Directions of the k sample points in texels t, and the integral of direction that each stands for, [t k 3]."""
     if samples == 1 and spot is None:
-        direction, area = (each(size=size).reshape(-1, 3) for each in (cubemap.direction, cubemap.vector_area))
+        direction, area = (texels(size=size).reshape(-1, 3) for texels in (cubemap.direction, cubemap.vector_area))
         return direction[texel, None], area[texel, None]
     place, weight = np.polynomial.legendre.leggauss(samples)
     face, row = jnp.divmod(texel[:, None, None], size**2)
@@ -486,7 +489,7 @@ def _points(texel: Int[Array, " t"], size: int, samples: int, spot: Float[Array,
 def _flux(normal: Float[Array, "3 v"], texel: Array, visible: Float[Array, "t v"], *, size: int) -> Array:
     """Visible solid angle of texels times the cosine."""
     area = cubemap.vector_area(size=size).reshape(-1, 3)[texel]
-    return jnp.maximum(_along(normal, area[:, None]), 0) * visible
+    return jnp.maximum(_component(normal, area[:, None]), 0) * visible
 
 
 def _largest(value: Float[Array, " n"], count: int) -> Int[Array, " t"]:
@@ -500,6 +503,6 @@ def _largest(value: Float[Array, " n"], count: int) -> Int[Array, " t"]:
     return row[place // _ROW] * _ROW + place % _ROW
 
 
-def _along(axis: Float[Array, "3 v"], direction: Float[Array, "*t 3"]) -> Array:
+def _component(axis: Float[Array, "3 v"], direction: Float[Array, "*t 3"]) -> Array:
     """Components of directions along one axis of each vertex's frame."""
     return axis[0] * direction[..., 0] + axis[1] * direction[..., 1] + axis[2] * direction[..., 2]

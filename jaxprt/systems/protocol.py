@@ -359,7 +359,7 @@ def albedo_view(
         ValueError: The eye is not finite, or the blend has another number of vertices or channels.
     """
     check_blend(blend)
-    require.position("the eye", eye, each=vertices)
+    require.position("the eye", eye, points=vertices)
     if blend is None:
         return albedo[None]
     blend.check(vertices, 1)

@@ -105,8 +105,8 @@ def radiance(
     for first in tqdm.trange(0, len(vertex), _BLOCK, desc="reference", disable=not progress):
         part = np.resize(vertex[first : first + _BLOCK], _BLOCK)
         seen, _ = visibility.fractional(rays, start[part], np.asarray(above[part], np.float32), size=size)
-        own = PerVertex(brdf.of(jnp.asarray(part))) if isinstance(brdf, PerVertex) else brdf
-        block = finished(integrate(seen, position[part], frame[part], own, light, eye, error=error), between)
+        model = PerVertex(brdf.of(jnp.asarray(part))) if isinstance(brdf, PerVertex) else brdf
+        block = finished(integrate(seen, position[part], frame[part], model, light, eye, error=error), between)
         result.append(block[..., : len(vertex) - first, :])
     return jnp.concatenate(result, -2)
 
@@ -156,13 +156,13 @@ def integrate(
     return jnp.swapaxes(smooth + sharp, 0, 1).reshape(*batch, *smooth.shape[::2])
 
 
-def _centers(given: adaptive.Integrand, seen: Array, error: Array) -> tuple[Array, adaptive.Choice, Array]:
+def _centers(integrand: adaptive.Integrand, seen: Array, error: Array) -> tuple[Array, adaptive.Choice, Array]:
     """Sums over texels that need no subdivision; data that decide about subdivision; and root cells to subdivide."""
     size = haar.face_edge(seen.shape[1])
-    direction, area = (_blocks(each(size=size)) for each in (cubemap.direction, cubemap.vector_area))
+    direction, area = (_blocks(texels(size=size)) for texels in (cubemap.direction, cubemap.vector_area))
     middle = jnp.mean(direction, 0)
-    light = jax.vmap(lambda each: _blocks(each.reshape(6, size, size, -1)), out_axes=1)(given.light)
-    level = jax.vmap(lambda each: _blocks(each.reshape(6, size, size)))(seen)
+    light = jax.vmap(lambda row: _blocks(row.reshape(6, size, size, -1)), out_axes=1)(integrand.light)
+    level = jax.vmap(lambda row: _blocks(row.reshape(6, size, size)))(seen)
     mean = jax.lax.stop_gradient(jnp.swapaxes(jnp.mean(light, -1), 0, 1))
     light = jnp.moveaxis(light, -1, 1)
 
@@ -170,7 +170,7 @@ def _centers(given: adaptive.Integrand, seen: Array, error: Array) -> tuple[Arra
     # over texels are explicit loops because XLA recomputes a value for each of its uses, except across loops.
     def one(argument):
         axes, wo, level, vertex = argument
-        brdf = given.brdf.of(vertex) if isinstance(given.brdf, PerVertex) else given.brdf
+        brdf = integrand.brdf.of(vertex) if isinstance(integrand.brdf, PerVertex) else integrand.brdf
         value = adaptive.value(brdf, directions.to_local(axes, direction.reshape(-1, 3)), wo)
         value = value.reshape(*level.shape, -1)
         flux = area @ axes[2]
@@ -191,7 +191,7 @@ def _centers(given: adaptive.Integrand, seen: Array, error: Array) -> tuple[Arra
         total = jax.lax.scan(add, jnp.zeros((len(mean), colors), value.dtype), (light, value, arriving))[0]
         return total, weight, height, chosen
 
-    total, weight, height, chosen = mapped(one, (given.frame, given.wo, level, jnp.arange(len(given.wo))))
+    total, weight, height, chosen = mapped(one, (integrand.frame, integrand.wo, level, jnp.arange(len(integrand.wo))))
     edge = size // adaptive.root(size)
     return total, adaptive.Choice(seen, weight, height, error), chosen.reshape(-1, 6, edge, edge)
 

@@ -99,7 +99,7 @@ class DynamicSystem(protocol.VertexSystem):
     def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> DynamicView:
         """View factors of the terms, and texels at which each vertex reads the blurred light for its lobes."""
         protocol.check_blend(materials)
-        eye = require.position("the eye", eye, each=self.vertices)
+        eye = require.position("the eye", eye, points=self.vertices)
         if materials is not None:
             materials.check(self.vertices, self.brdf.channels)
         wo = _direction(self.transport.position, self.transport.frame, self.points, eye)

@@ -50,7 +50,7 @@ def _matrix(value: Any) -> None:
 def _eyes(value: Any) -> Array:
     require.real("the eye", value)
     shape = jnp.shape(value)
-    return require.position("the eye", value, each=shape[0] if len(shape) == 2 else None)
+    return require.position("the eye", value, points=shape[0] if len(shape) == 2 else None)
 
 
 def _degree(value: Any) -> None:
@@ -303,7 +303,7 @@ def blended_view(
         ValueError: The blend has another number of vertices or channels.
     """
     protocol.check_blend(materials)
-    eye = require.position("the eye", eye, each=len(position))
+    eye = require.position("the eye", eye, points=len(position))
     parameter = () if materials is None else materials.parameter
     row = view_coefficients(brdf, position, frame, *parameter, eye=eye)
     if materials is None:

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Float32, Int
 
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.scene import PointLight
-from jaxprt.systems.lamps.transport import LampTransport, sampled
+from jaxprt.systems.lamps.transport import LampTransport, sample_surface
 from jaxprt.visibility.picture_rays import LampPlaces
 
 _PLACES = 4096  # places on a surface to which rays may go
@@ -37,18 +37,17 @@ def places(lamps: Sequence[Mesh | PointLight], power: Float[np.ndarray, " n"], *
         levels = _levels(lamp)
         # Points see half of a lamp that turns to all sides: a closed surface, or a sheet with two sides.
         sides.append(2 if _is_closed(levels[-1][1]) else 1)
-        own = min(pieces * sides[-1], _CUTS) if isinstance(lamp, Mesh) else 1
-        cut.append(own)
+        cut.append(min(pieces * sides[-1], _CUTS) if isinstance(lamp, Mesh) else 1)
         size = np.array([len(place) for place, _ in levels])
         first.append(total + np.cumsum(size) - size)
-        count.append(size // own)
+        count.append(size // cut[-1])
         rows += levels
         total += int(size.sum())
-    place, area = (np.concatenate(each).astype(np.float32) for each in zip(*rows, strict=True))
+    place, area = (np.concatenate(column).astype(np.float32) for column in zip(*rows, strict=True))
     share = np.asarray(power, np.float64) / max(float(np.sum(power)), np.finfo(float).tiny)
-    wanted = 2 ** np.round(np.log2(np.maximum(_RAYS * share, 1)))
-    strata = sides * np.clip(wanted, _FEWEST, [_MOST if isinstance(lamp, Mesh) else _FEWEST for lamp in lamps])
-    return LampPlaces(place, area, *(np.asarray(each, np.int64) for each in (first, count, cut, strata)))
+    rays = 2 ** np.round(np.log2(np.maximum(_RAYS * share, 1)))
+    strata = sides * np.clip(rays, _FEWEST, [_MOST if isinstance(lamp, Mesh) else _FEWEST for lamp in lamps])
+    return LampPlaces(place, area, *(np.asarray(column, np.int64) for column in (first, count, cut, strata)))
 
 
 def _levels(lamp: Mesh | PointLight) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -57,7 +56,7 @@ def _levels(lamp: Mesh | PointLight) -> list[tuple[np.ndarray, np.ndarray]]:
     if isinstance(lamp, PointLight):
         alone = np.asarray(lamp.position, np.float64)[None], np.zeros((1, 3))
         return [(empty, empty)] * (len(_LEVELS) - 1) + [alone]
-    place, area = sampled(lamp, count=_PLACES)
+    place, area = sample_surface(lamp, count=_PLACES)
     # Places on the two sides of a sheet are as far apart as places on opposite ends of it.
     side = area / np.linalg.norm(area, axis=1, keepdims=True) * np.ptp(place, axis=0).max()
     order = _order(np.concatenate([place, side], 1))
@@ -108,8 +107,8 @@ def at_points(
             way = where - np.asarray(lamp.position, where.dtype)
             way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), np.finfo(where.dtype).tiny)
             share = lamp.share(way)
-            for own in moment:
-                own[row] *= share
+            for integral in moment:
+                integral[row] *= share
     number = tuple(np.repeat(np.arange(len(lamps)), pieces).tolist())
-    solid, cosine, direction = (jax.device_put(own.astype(where.dtype, copy=False)) for own in moment)
+    solid, cosine, direction = (jax.device_put(row.astype(where.dtype, copy=False)) for row in moment)
     return LampTransport(solid, cosine, direction, position, frame, number)

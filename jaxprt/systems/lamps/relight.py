@@ -88,7 +88,7 @@ class LitByLamps(eqx.Module):
             ValueError: The blend has another number of vertices or channels, or the eye is not finite.
         """
         count = len(self.transport.position if points is None else points)
-        eye = require.position("the eye", eye, each=count)
+        eye = require.position("the eye", eye, points=count)
         check_blend(blend)
         if blend is not None:
             blend.check(count, 1 if self.brdf is None else len(self.brdf.weight))
@@ -117,13 +117,13 @@ class LitByLamps(eqx.Module):
             ValueError: The number of rows of `radiance` differs from the number of lamps.
         """
         require.length("rows of the lamps' radiance", radiance, self.transport.lamps)
-        return summed(radiance, view)
+        return combine(radiance, view)
 
 
 @jit
-def summed(radiance: Float[Array, "n d"], view: Float[Array, "n v c"]) -> Float[Array, "v e"]:
+def combine(radiance: Float[Array, "n d"], view: Float[Array, "n v c"]) -> Float[Array, "v e"]:
     """`LitByLamps.combine`, of views of any surface."""
-    return reduce(jnp.add, (own * each for own, each in zip(radiance, view, strict=True)))
+    return reduce(jnp.add, (lamp * response for lamp, response in zip(radiance, view, strict=True)))
 
 
 @jit
@@ -131,28 +131,28 @@ def _view(
     lit: LitByLamps, eye: Array, blend: Blend | None, points: Points | None, traced: Array | None
 ) -> Float[Array, "n v c"]:
     transport = lit.transport
-    solid, cosine, way = _carried(transport, points)
+    solid, cosine, way = _integrals(transport, points)
     matte = cosine / np.pi
     if lit.brdf is None:
-        each = matte[:, None] * (lit.albedo[:, None] if blend is None else 1)
+        piece = matte[:, None] * (lit.albedo[:, None] if blend is None else 1)
     else:
         position, frame = placed(transport.position, transport.frame, points)
         parameter = () if blend is None else blend.parameter
         lobe = lit.brdf.lookup(directions.view(frame, position, eye), *parameter)
         whole = _chord(transport, points)[np.asarray(transport.lamp)]
-        each = jax.lax.map(partial(_sent, lobe, frame, traced), (solid, way, matte, whole))
+        piece = jax.lax.map(partial(_reflect, lobe, frame, traced), (solid, way, matte, whole))
     numbers = np.asarray(transport.lamp)
-    value = jax.ops.segment_sum(each, numbers, transport.lamps, indices_are_sorted=True)  # [n, k, v]
+    value = jax.ops.segment_sum(piece, numbers, transport.lamps, indices_are_sorted=True)  # [n, k, v]
     if blend is None:
         return jnp.moveaxis(value, 1, 2)
     return jnp.einsum("nkv,vkc->nvc", value, blend.weight, precision="highest")
 
 
-def _carried(transport: LampTransport, points: Points | None) -> tuple[Array, Array, Array]:
+def _integrals(transport: LampTransport, points: Points | None) -> tuple[Array, Array, Array]:
     """The transport's integrals at the vertices, or interpolated to points."""
     solid, cosine, way = transport.solid_angle, transport.cosine, transport.direction
     if points is not None:
-        solid, cosine, way = (points.carry(each, axis=-1) for each in (solid, cosine, way))
+        solid, cosine, way = (points.carry(row, axis=-1) for row in (solid, cosine, way))
         if points.normal is not None:
             # The integral of direction gives that of the cosine with the tilted normal.
             tilt = points.normal - points.tilted(None).frame(transport.frame)[:, 2].T
@@ -162,16 +162,16 @@ def _carried(transport: LampTransport, points: Points | None) -> tuple[Array, Ar
 
 @jit
 def _chord(transport: LampTransport, points: Points | None) -> Float[Array, "n v"]:
-    solid, _, way = _carried(transport, points)
+    solid, _, way = _integrals(transport, points)
     numbers = np.asarray(transport.lamp)
     whole, moment = (
-        jax.ops.segment_sum(each, numbers, transport.lamps, indices_are_sorted=True) for each in (solid, way)
+        jax.ops.segment_sum(row, numbers, transport.lamps, indices_are_sorted=True) for row in (solid, way)
     )
     return 4 * jnp.clip(1 - jnp.sqrt(jnp.sum(moment**2, 1)) / jnp.maximum(whole, _TINY), 0, 1)
 
 
 @jit
-def beside(concentration: Float[Array, "*b"], chord: Float[Array, "*c"]) -> Float[Array, "..."]:
+def ray_share(concentration: Float[Array, "*b"], chord: Float[Array, "*c"]) -> Float[Array, "..."]:
     """Share of a lobe that rays may trace to a lamp: 1 for lobes much narrower than the lamp, 0 for wider ones.
 
     Args:
@@ -183,19 +183,19 @@ def beside(concentration: Float[Array, "*b"], chord: Float[Array, "*c"]) -> Floa
     return place**2 * (3 - 2 * place)
 
 
-def _sent(lobe: Lobes, frame: Array, traced: Array | None, piece: tuple[Array, ...]) -> Float[Array, "k v"]:
+def _reflect(lobe: Lobes, frame: Array, traced: Array | None, piece: tuple[Array, ...]) -> Float[Array, "k v"]:
     """Radiance reflected by each channel of the BRDF, from one piece of a lamp of radiance 1."""
     solid, way, matte, whole = piece
     length = jnp.sqrt(jnp.maximum(jnp.sum(way**2, 0), _TINY))
     toward = [sum(way[j] * frame[:, i, j] for j in range(3)) / length for i in range(3)]
     chord = 4 * jnp.clip(1 - length / jnp.maximum(solid, _TINY), 0, 1)
-    density = met(lobe.mean, lobe.concentration, toward, chord)
+    density = mean_density(lobe.mean, lobe.concentration, toward, chord)
     if traced is not None:
-        density = density * (1 - traced * traced_share(lobe.concentration) * beside(lobe.concentration, whole))
+        density = density * (1 - traced * traced_share(lobe.concentration) * ray_share(lobe.concentration, whole))
     return jnp.sum(lobe.weight * density, 1) * solid + lobe.diffuse * matte
 
 
-def met(mean: Array, concentration: Array, toward: Sequence[Array], chord: Array) -> Float[Array, "l v"]:
+def mean_density(mean: Array, concentration: Array, toward: Sequence[Array], chord: Array) -> Float[Array, "l v"]:
     """Mean density of lobes over disks on the sphere, in 1/sr.
 
     Args:

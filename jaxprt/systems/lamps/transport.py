@@ -121,16 +121,16 @@ def precompute(
     require.whole("pieces", pieces)
     if pieces < 1 or pieces & (pieces - 1) or pieces > samples:
         raise ValueError(f"pieces must be a power of two, and at most the {samples} samples, got {pieces}")
-    for number, each in enumerate(lamps):
-        require.kind(f"lamp {number}", each, Mesh, PointLight, source="jaxprt.load_mesh")
+    for number, lamp in enumerate(lamps):
+        require.kind(f"lamp {number}", lamp, Mesh, PointLight, source="jaxprt.load_mesh")
     lamps = [_relative(lamp, mesh.origin) for lamp in lamps]
     coarse, fine = (_Samples.of(lamps, count, pieces) for count in (samples, _FINER * samples))
-    lamp = [number for number, each in enumerate(lamps) for _ in range(pieces if isinstance(each, Mesh) else 1)]
+    owner = np.repeat(np.arange(len(lamps)), [pieces if isinstance(lamp, Mesh) else 1 for lamp in lamps])
     job = _Job.make(mesh, occluder, vertex, 1, apart=apart, coarse=coarse, fine=fine)
-    found = visibility.blocks.compute(job, run, label="lamps")["moment"]
-    solid, cosine, *direction = (jax.device_put(np.ascontiguousarray(each.T)) for each in np.moveaxis(found, 2, 0))
+    moment = visibility.blocks.compute(job, run, label="lamps")["moment"]
+    solid, cosine, *direction = (jax.device_put(np.ascontiguousarray(row.T)) for row in np.moveaxis(moment, 2, 0))
     position, frame = visibility.rays.place(mesh, vertex), jax.device_put(job.frame)
-    return LampTransport(solid, cosine, jnp.stack(direction, 1), position, frame, tuple(lamp))
+    return LampTransport(solid, cosine, jnp.stack(direction, 1), position, frame, tuple(owner.tolist()))
 
 
 def _relative(lamp: Mesh | PointLight, origin: origins.Origin) -> Mesh | PointLight:
@@ -154,18 +154,18 @@ class _Samples(NamedTuple):
     @classmethod
     def of(cls, lamps: Sequence[Mesh | PointLight], count: int, pieces: int) -> "_Samples":
         points, sizes, spots = [], [], []
-        for each in lamps:
-            if isinstance(each, PointLight) and each.axis is not None:
-                spots.append((sum(sizes), each))
-            place, area = sampled(each, count=count) if isinstance(each, Mesh) else _alone(each)
-            order = _halved(place, pieces if isinstance(each, Mesh) else 1)
-            points.append((place[np.concatenate(order)], area[np.concatenate(order)]))
-            sizes += [len(own) for own in order]
-        place, area = (np.concatenate(each).astype(np.float32) for each in zip(*points, strict=True))
+        for lamp in lamps:
+            if isinstance(lamp, PointLight) and lamp.axis is not None:
+                spots.append((sum(sizes), lamp))
+            place, area = sample_surface(lamp, count=count) if isinstance(lamp, Mesh) else _point_sample(lamp)
+            parts = _cut(place, pieces if isinstance(lamp, Mesh) else 1)
+            points.append((place[np.concatenate(parts)], area[np.concatenate(parts)]))
+            sizes += [len(part) for part in parts]
+        place, area = (np.concatenate(column).astype(np.float32) for column in zip(*points, strict=True))
         return cls(place, area, np.asarray(sizes), spots)
 
 
-def sampled(lamp: Mesh, *, count: int) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
+def sample_surface(lamp: Mesh, *, count: int) -> tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]:
     """Points spread evenly over a surface, and the area of each times the surface normal there.
 
     Args:
@@ -176,7 +176,7 @@ def sampled(lamp: Mesh, *, count: int) -> tuple[Float[np.ndarray, "s 3"], Float[
         ValueError: The surface has no area, or its positions are not finite.
     """
     visibility.occluder.check(lamp, "lamp")
-    corner, normal = (np.asarray(each, np.float64)[np.asarray(lamp.face)] for each in (lamp.position, lamp.normal))
+    corner, normal = (np.asarray(row, np.float64)[np.asarray(lamp.face)] for row in (lamp.position, lamp.normal))
     across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
     across *= np.where(np.sum(across * normal.sum(1), 1) < 0, -1, 1)[:, None]
     area = np.linalg.norm(across, axis=1)
@@ -194,19 +194,19 @@ def sampled(lamp: Mesh, *, count: int) -> tuple[Float[np.ndarray, "s 3"], Float[
     return place, across[triangle] / area[triangle, None] * (total[-1] / count)
 
 
-def _alone(light: PointLight) -> tuple[np.ndarray, np.ndarray]:
+def _point_sample(light: PointLight) -> tuple[np.ndarray, np.ndarray]:
     """A point light as one sample of zero area."""
     return np.asarray(light.position, np.float64)[None], np.zeros((1, 3))
 
 
-def _halved(place: np.ndarray, pieces: int) -> list[np.ndarray]:
+def _cut(place: np.ndarray, pieces: int) -> list[np.ndarray]:
     """Indices of the points of each piece, by repeated halving across the longest extent."""
     parts = [np.arange(len(place))]
     while len(parts) < pieces:
         halves = []
-        for own in parts:
-            axis = np.argmax(np.ptp(place[own], axis=0))
-            order = own[np.argsort(place[own, axis], kind="stable")]
+        for part in parts:
+            axis = np.argmax(np.ptp(place[part], axis=0))
+            order = part[np.argsort(place[part, axis], kind="stable")]
             halves += [order[: len(order) // 2], order[len(order) // 2 :]]
         parts = halves
     return parts
@@ -242,10 +242,10 @@ class _Job(visibility.rays.VisibilityJob):
         """Computes one block."""
         part = self.part(block)
         start, normal = self.start[part], self.frame[part, 2]
-        moment, rays = self._seen(start, normal, self.coarse)
+        moment, rays = self._moments(start, normal, self.coarse)
         near = np.flatnonzero(self._is_near(start))
         if near.size:
-            moment[near], more = self._seen(start[near], normal[near], self.fine)
+            moment[near], more = self._moments(start[near], normal[near], self.fine)
             rays += more
         return {"moment": moment}, rays
 
@@ -254,7 +254,7 @@ class _Job(visibility.rays.VisibilityJob):
         square = np.sum((self.coarse.place - start[:, None]) ** 2, -1)
         return np.any(square < _CLOSE**2 / np.pi * np.linalg.norm(self.coarse.area, axis=1), 1)
 
-    def _seen(self, start: np.ndarray, normal: np.ndarray, samples: _Samples) -> tuple[np.ndarray, int]:
+    def _moments(self, start: np.ndarray, normal: np.ndarray, samples: _Samples) -> tuple[np.ndarray, int]:
         """The integrals at the given points, and the number of rays traced."""
         way = samples.place - start[:, None]
         # The distance to a point light is at least the offset of ray origins, so that lamps on a surface stay finite.

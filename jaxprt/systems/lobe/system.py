@@ -192,7 +192,7 @@ def view_lobes(
         ValueError: The number of parameters differs from the table's, or the eye is not finite, or is neither one
             position nor one for each vertex or point.
     """
-    eye = require.position("the eye", eye, each=len(transport.position if points is None else points))
+    eye = require.position("the eye", eye, points=len(transport.position if points is None else points))
     return _view_lobes(transport, brdf, parameter, eye, points, variance)
 
 

@@ -143,7 +143,7 @@ def view_tuple(
 
     Reference: Wang, Tran, Luebke 2004, sections 3.1 and 3.4.
     """
-    eye = require.position("the eye", eye, each=len(position))
+    eye = require.position("the eye", eye, points=len(position))
     return _view_tuple(brdf, position, frame, eye)
 
 

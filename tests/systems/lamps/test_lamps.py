@@ -146,7 +146,9 @@ def test_lobes_over_disks_are_normal_distributions_over_disks(chord):
     for concentration in (3.0, 40.0, 700.0):
         mean = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0])[:, None, None], (3, 1, 25))
         sharp, size = jnp.full((1, 25), concentration), jnp.full(25, chord)
-        got = np.asarray(lamps.relight.met(mean, sharp, [jnp.asarray(x, jnp.float32) for x in toward], size))[0]
+        got = np.asarray(lamps.relight.mean_density(mean, sharp, [jnp.asarray(x, jnp.float32) for x in toward], size))[
+            0
+        ]
         offset = concentration * np.sum((toward - np.array([[0], [0], [1.0]])) ** 2, 0)
         if chord:
             inside = scipy.stats.ncx2.cdf(concentration * chord, 2, offset) / (np.pi * chord)
