@@ -15,7 +15,7 @@ from jaxprt.compile import promoted
 from jaxprt.files import objects
 from jaxprt.relit import channels, groups, lamps, refinement, reflection, registry, tracing, warn
 from jaxprt.relit.channels import Shading
-from jaxprt.relit.measuring import checked, lights_of
+from jaxprt.relit.measuring import check_lights, lights_of
 from jaxprt.relit.planning import ERROR, MARGIN, Plan, key_of, plan
 from jaxprt.relit.recipes import Recipe, Target, check
 from jaxprt.relit.scene import RAYS, RelitScene
@@ -181,7 +181,7 @@ def _check_options(size, error, rate, environments, rays) -> None:
         if value is not None:
             require.number(name, value, 0.0, above=True)
     if environments is not None:
-        checked(environments, 1.0, 1.0)
+        check_lights(environments, 1.0, 1.0)
     tracing.check_rays(rays)
 
 

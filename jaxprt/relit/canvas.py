@@ -54,9 +54,9 @@ def points_of(
         index: Indices of the points; -1 in padding, which repeats the first point.
     """
     xp: Any = np if known(pixels, face, shift, index) else jnp
-    own = xp.where(index < 0, xp.maximum(index[0], 0), index)
-    corner = xp.asarray(face)[xp.maximum(xp.asarray(pixels.triangle)[own], 0)].T
-    weight, slope = (xp.asarray(each)[own] for each in (pixels.barycentric, pixels.slope))
+    index = xp.where(index < 0, xp.maximum(index[0], 0), index)
+    corner = xp.asarray(face)[xp.maximum(xp.asarray(pixels.triangle)[index], 0)].T
+    weight, slope = (xp.asarray(column)[index] for column in (pixels.barycentric, pixels.slope))
     # Padding of the picture itself has weights of zero. It lies on a vertex, so that its colors are finite.
     weight = xp.where(xp.sum(weight, 1, keepdims=True) > 0, weight, xp.asarray([1.0, 0.0, 0.0], weight.dtype)).T
     slope = xp.moveaxis(slope, 0, -1)
@@ -110,15 +110,15 @@ def drawn(
     """
     xp = np if known(pixels, index) else jnp
     index = index.reshape(-1)
-    own = xp.maximum(index, 0)
-    pixel, coverage = (xp.asarray(each)[own] for each in (pixels.pixel, pixels.coverage))
+    point = xp.maximum(index, 0)
+    pixel, coverage = (xp.asarray(column)[point] for column in (pixels.pixel, pixels.coverage))
     coverage = by_color(coverage, picture.shape[2])
     coverage = xp.where((index < 0)[:, None], xp.zeros((), coverage.dtype), coverage)
-    return _added(picture, pixel, coverage, color.reshape(-1, color.shape[-1]))
+    return _add(picture, pixel, coverage, color.reshape(-1, color.shape[-1]))
 
 
 @partial(jit, donate_argnames="picture")
-def _added(
+def _add(
     picture: Float[Array, "h w c"], pixel: Int[Array, " p"], coverage: Float[Array, "p _"], color: Float[Array, "p d"]
 ) -> Float[Array, "h w c"]:
     height, width, colors = picture.shape

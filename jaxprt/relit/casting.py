@@ -15,7 +15,7 @@ from jaxprt.systems.bounces.traced import ReflectionRays
 from jaxprt.visibility import Occluder, point_starts, start_points
 from jaxprt.visibility.rays import first_fronts
 
-_KEPT = 4  # number of scenes that are cached
+_CACHED = 4  # number of scenes that are cached
 
 
 class Caster:
@@ -34,8 +34,8 @@ class Caster:
         """Curvature of each triangle: change of the shading normal over distance, root mean square over its edges."""
         position = np.asarray(self.mesh.position)
         turn, length = (
-            sum(((each[self.face[:, i]] - each[self.face[:, i - 1]]) ** 2).sum(1) for i in range(3))
-            for each in (self.normal, position)
+            sum(((column[self.face[:, i]] - column[self.face[:, i - 1]]) ** 2).sum(1) for i in range(3))
+            for column in (self.normal, position)
         )
         return np.sqrt(turn / np.maximum(length, np.finfo(np.float32).tiny))
 
@@ -57,13 +57,13 @@ class Caster:
         way, chance = np.asarray(rays.direction, np.float32), np.asarray(rays.chance)
         corner = np.asarray(points.corner).T[:, : 1 if at_vertices else 3]
         start = self.start[corner[:, 0]] if at_vertices else point_starts(self.mesh, points)
-        ray, own = np.nonzero(chance > 0)
+        ray, point = np.nonzero(chance > 0)
         triangle, barycentric = np.full(chance.shape, -1), np.zeros((*chance.shape, 3), np.float32)
-        found, weight = first_fronts(self.occluder, self.normal, start[own], np.ascontiguousarray(way[ray, own]))
+        hit, weight = first_fronts(self.occluder, self.normal, start[point], np.ascontiguousarray(way[ray, point]))
         # Ignore hits of the ray's own triangle, or of a triangle around its own vertex: the origin may lie below it.
-        met = self.face[found]
-        itself = np.any(met == corner[own], 1) if at_vertices else np.all(met == corner[own], 1)
-        triangle[ray, own], barycentric[ray, own] = np.where(itself, -1, found), weight
+        same = self.face[hit] == corner[point]
+        itself = np.any(same, 1) if at_vertices else np.all(same, 1)
+        triangle[ray, point], barycentric[ray, point] = np.where(itself, -1, hit), weight
         return triangle, barycentric, start
 
     def spread(
@@ -102,12 +102,12 @@ def caster(mesh: Mesh) -> Caster:
     """The `Caster` of a mesh. Those of the last few scenes are cached."""
     key = id(mesh.position)
     with _LOCK:
-        alive, kept = _CASTERS.get(key, (lambda: None, None))
-        if kept is not None and alive() is mesh.position:
+        alive, cached = _CASTERS.get(key, (lambda: None, None))
+        if cached is not None and alive() is mesh.position:
             _CASTERS.move_to_end(key)
-            return kept
-        made = Caster(mesh)
-        _CASTERS[key] = weakref.ref(mesh.position), made
-        while len(_CASTERS) > _KEPT:
+            return cached
+        result = Caster(mesh)
+        _CASTERS[key] = weakref.ref(mesh.position), result
+        while len(_CASTERS) > _CACHED:
             _CASTERS.popitem(last=False)
-        return made
+        return result

@@ -90,7 +90,7 @@ class Shading(eqx.Module):
     def smoothest(self) -> Any:
         """Logarithm of the smallest roughness, as the standard table takes it: with that of a layer if any."""
         assert self.blend is not None
-        least = tuple(float(np.min(np.asarray(each))) for each in self.blend.parameter)
+        least = tuple(float(np.min(np.asarray(row))) for row in self.blend.parameter)
         return least if self.layered else least[0]
 
 
@@ -157,14 +157,14 @@ def of_part(
         brdf = grid.as_argument(material)
         return Shading(part.mesh, brdf, brdf)
     look = _look(part) if look is None else look
-    mesh, anisotropy = _framed(part)
+    mesh, anisotropy = _anisotropic_mesh(part)
     emitted = look.emitted if np.any(look.emitted) else None
     if np.any(look.coefficient[:, len(_NAMES) :]):
         table = _table_of_layer(part)
         if anisotropy <= _EQUAL and takes(table):
             exact = PerVertex(_layered(part.name, look, table))
-            own = blend(look, table.term, table.scale, varies=True)
-            return Shading(mesh, table.family, exact, table.knots, own, emitted, table.term, table.scale, table)
+            weights = blend(look, table.term, table.scale, varies=True)
+            return Shading(mesh, table.family, exact, table.knots, weights, emitted, table.term, table.scale, table)
         look = _without_layer(part.name, look, table)
     exact = PerVertex(_metallic(look, anisotropy))
     needed = tuple(k for k in range(len(_NAMES)) if np.any(look.coefficient[:, k])) or _BARE
@@ -173,12 +173,12 @@ def of_part(
         return Shading(mesh, Lambert(1.0), exact, (), blend(look, _BARE, scale, varies=False), emitted, _BARE, scale)
     table = standard.METALLIC_ROUGHNESS
     if anisotropy > _EQUAL or not takes(table):
-        return _alone(mesh, exact, look, emitted, needed, anisotropy)
-    own = blend(look, table.term, table.scale, varies=True)
-    return Shading(mesh, table.family, exact, (table.knot,), own, emitted, table.term, table.scale, table)
+        return _with_own_table(mesh, exact, look, emitted, needed, anisotropy)
+    weights = blend(look, table.term, table.scale, varies=True)
+    return Shading(mesh, table.family, exact, (table.knot,), weights, emitted, table.term, table.scale, table)
 
 
-def _alone(
+def _with_own_table(
     mesh: Mesh, exact: PerVertex, look: MaterialLook, emitted: Any, term: tuple[int, ...], anisotropy: float
 ) -> Shading:
     """A part with a table of its own, over the roughness that it has."""
@@ -199,8 +199,8 @@ def _of_model(
     if not takes(table) or not _in_range(brdf, table):
         return Shading(part.mesh, brdf, brdf)
     look = _look(part) if look is None else look
-    own = blend(look, table.term, table.scale, varies=True)
-    return Shading(part.mesh, table.family, brdf, (table.knot,), own, None, table.term, table.scale, table)
+    weights = blend(look, table.term, table.scale, varies=True)
+    return Shading(part.mesh, table.family, brdf, (table.knot,), weights, None, table.term, table.scale, table)
 
 
 def _in_range(brdf: BlinnPhong | CookTorrance, table: StandardTable) -> bool:
@@ -213,11 +213,11 @@ def _in_range(brdf: BlinnPhong | CookTorrance, table: StandardTable) -> bool:
 
 def looks(parts: Sequence[Part]) -> list[MaterialLook]:
     """The materials at the vertices of each part, by one program for all."""
-    every, result, first = material_table.of_parts(parts).at_vertices(), [], 0
+    columns, result, first = tuple(material_table.of_parts(parts).at_vertices()), [], 0
     for part in parts:
-        own = slice(first, first + len(part.mesh.position))
-        result.append(MaterialLook(*jax.tree.map(lambda each, own=own: each[own], tuple(every))))
-        first = own.stop
+        vertex = slice(first, first + len(part.mesh.position))
+        result.append(MaterialLook(*jax.tree.map(lambda column, vertex=vertex: column[vertex], columns)))
+        first = vertex.stop
     return result
 
 
@@ -312,7 +312,7 @@ def as_shaded(part: Part, shading: Shading) -> Part:
     material = part.material
     if not isinstance(material, TexturedMaterial):
         return part
-    coat, fibers = (material_table.may_be(each) for each in (material.clearcoat, material.sheen_color))
+    coat, fibers = (material_table.may_be(factor) for factor in (material.clearcoat, material.sheen_color))
     if not shading.layered and (coat or fibers):
         material = without_layers(material)
     elif shading.table == standard.COATED and fibers:
@@ -347,13 +347,13 @@ def appearance(part: Part, shading: Shading, material: Changeable, *, look: Mate
     new = replaced(part, shading, material)
     look = _look(new) if look is None else look
     assert shading.scale is not None
-    own = blend(look, shading.term, shading.scale, varies=bool(shading.knot))
+    weights = blend(look, shading.term, shading.scale, varies=bool(shading.knot))
     emitted = None if known(look.emitted) and not np.any(look.emitted) else look.emitted
     if isinstance(material, BlinnPhong | CookTorrance):
-        return Appearance(own)
+        return Appearance(weights)
     fits = _fits(part.name, shading, look)
-    weight = own.weight if known(fits) else jnp.where(fits[:, None, None], own.weight, jnp.nan)
-    return Appearance(Blend(weight, own.parameter), emitted)
+    weight = weights.weight if known(fits) else jnp.where(fits[:, None, None], weights.weight, jnp.nan)
+    return Appearance(Blend(weight, weights.parameter), emitted)
 
 
 def replaced(part: Part, shading: Shading, material: Changeable) -> Part:
@@ -423,8 +423,9 @@ def at_points(part: Part, shading: Shading, material: Any, points: Points) -> Ap
     if shading.blend is None:
         return Appearance(None)
     assert shading.scale is not None
-    own = part if material is None else dataclasses.replace(part, material=material)
-    look = material_table.of_parts([own]).at(points)
+    if material is not None:
+        part = dataclasses.replace(part, material=material)
+    look = material_table.of_parts([part]).at(points)
     return Appearance(blend(look, shading.term, shading.scale, varies=bool(shading.knot)), look.emitted)
 
 
@@ -440,16 +441,16 @@ def materials_at(parts: Sequence[Part], shading: Shading, points: Points) -> tup
         return None, shading.exact
     assert shading.scale is not None
     look = material_table.of_parts(parts).at(points)
-    own = blend(look, shading.term, shading.scale, varies=bool(shading.knot))
+    weights = blend(look, shading.term, shading.scale, varies=bool(shading.knot))
     values = look.values
     if isinstance(parts[0].material, BlinnPhong):
         exponent = 2 / values.roughness**2 - 2
-        return own, PerVertex(BlinnPhong(values.base_color, values.specular_color, exponent))
+        return weights, PerVertex(BlinnPhong(values.base_color, values.specular_color, exponent))
     if isinstance(parts[0].material, CookTorrance):
         mirror, rim = look.coefficient[:, 1], look.coefficient[:, 2]
         f0 = mirror / jnp.maximum(mirror + rim, _TINY)
-        return own, PerVertex(CookTorrance(values.base_color, mirror + rim, values.roughness, f0))
-    return own, PerVertex(_model(parts[0].name, look, shading))
+        return weights, PerVertex(CookTorrance(values.base_color, mirror + rim, values.roughness, f0))
+    return weights, PerVertex(_model(parts[0].name, look, shading))
 
 
 def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Array | np.ndarray | None, Points]:
@@ -483,10 +484,11 @@ def _fits(name: str, shading: Shading, look: MaterialLook) -> Any:
     low, high = _log_range(shading)
     inside = (look.log_roughness >= low - _EQUAL) & (look.log_roughness <= high + _EQUAL)
     if known(inside) and not np.all(inside):
-        given = jnp.exp(jax.lax.stop_gradient(look.log_roughness))
+        roughness = jnp.exp(jax.lax.stop_gradient(look.log_roughness))
         raise ValueError(
-            f"part {name!r} was precomputed for roughness from {np.exp(low):.3f} to {np.exp(high):.3f}, got a material "
-            f"from {jnp.min(given):.3f} to {jnp.max(given):.3f}: precompute it with a material that covers both ranges"
+            f"part {name!r} was precomputed for roughness from {np.exp(low):.3f} to {np.exp(high):.3f}, got a "
+            f"material from {jnp.min(roughness):.3f} to {jnp.max(roughness):.3f}: precompute it with a material that "
+            "covers both ranges"
         )
     return fits & inside
 
@@ -505,14 +507,14 @@ def _log_range(shading: Shading) -> tuple[float, float]:
         return float(shading.knot[0][0]), float(shading.knot[0][-1])
     assert isinstance(shading.exact, PerVertex)
     assert isinstance(shading.exact.model, MetallicRoughness)
-    own = np.log(np.maximum(np.asarray(shading.exact.model.roughness), SMOOTHEST))
-    return float(own.min()), float(own.max())
+    value = np.log(np.maximum(np.asarray(shading.exact.model.roughness), SMOOTHEST))
+    return float(value.min()), float(value.max())
 
 
 def _check_frames(part: Part, shading: Shading, new: Part) -> None:
     """Refuses an anisotropy that differs from the precomputed one, and normal maps where there was none."""
     before, material = _anisotropy(shading), part.material
-    mesh, now = _framed(new)
+    mesh, now = _anisotropic_mesh(new)
     if getattr(new.material, "normal_texture", None) is not None and getattr(material, "normal_texture", None) is None:
         raise ValueError(
             f"part {part.name!r} was precomputed without a normal map, got a material with one: precompute it with a "
@@ -524,8 +526,7 @@ def _check_frames(part: Part, shading: Shading, new: Part) -> None:
         )
     if mesh is shading.mesh or before <= _EQUAL or shading.matte:
         return
-    first, second = (np.asarray(each.tangent) for each in (shading.mesh, mesh))
-    if np.abs(first - second).max() > _EQUAL:
+    if np.abs(np.asarray(shading.mesh.tangent) - np.asarray(mesh.tangent)).max() > _EQUAL:
         raise ValueError(
             f"part {part.name!r} was precomputed with another direction of anisotropy, or with none: precompute it "
             "with the new one"
@@ -541,7 +542,7 @@ def _anisotropy(shading: Shading) -> float:
     return float(shading.exact.model.anisotropy[0])
 
 
-def _framed(part: Part) -> tuple[Mesh, float]:
+def _anisotropic_mesh(part: Part) -> tuple[Mesh, float]:
     """The mesh with tangents along the anisotropy, and the mean anisotropy."""
     material = part.material
     assert isinstance(material, TexturedMaterial)
@@ -555,7 +556,7 @@ def _framed(part: Part) -> tuple[Mesh, float]:
             f"texture, which is not supported: its mean {strength.mean():.2f} is used everywhere",
             stacklevel=3,
         )
-    return _turned(part.mesh, surface), float(strength.mean())
+    return _rotate_tangents(part.mesh, surface), float(strength.mean())
 
 
 def _knots(log_roughness: Float[np.ndarray, " v"]) -> tuple[np.ndarray, ...]:
@@ -566,16 +567,18 @@ def _knots(log_roughness: Float[np.ndarray, " v"]) -> tuple[np.ndarray, ...]:
     return (np.linspace(low, high, 1 + int(np.ceil((high - low) / np.log(_STEP)))),)
 
 
-def _turned(mesh: Mesh, surface: MaterialValues) -> Mesh:
+def _rotate_tangents(mesh: Mesh, surface: MaterialValues) -> Mesh:
     """The mesh with tangents along the anisotropy."""
     straight = bool(np.all(np.asarray(surface.direction) == [1, 0])) or not np.any(np.asarray(surface.anisotropy))
     return (
-        mesh if straight else eqx.tree_at(lambda each: each.tangent, mesh, _along(mesh.normal, mesh.tangent, surface))
+        mesh
+        if straight
+        else eqx.tree_at(lambda mesh: mesh.tangent, mesh, _tangents(mesh.normal, mesh.tangent, surface))
     )
 
 
 @jit
-def _along(normal: Array, tangent: Array, surface: MaterialValues) -> Array:
+def _tangents(normal: Array, tangent: Array, surface: MaterialValues) -> Array:
     frame = directions.frame(normal, tangent)
     along = jnp.einsum("vi,vij->vj", surface.direction, frame[:, :2], precision="highest")
     return directions.frame(normal, along)[:, 0]

@@ -84,7 +84,7 @@ def uneven(mesh: Mesh, camera: Camera, curvature: Float[Array, " v"]) -> Bool[Ar
     cosine = jnp.sum(mesh.normal * toward, -1)
     mirror = 2 * cosine[:, None] * mesh.normal - toward
     a, b, c = mesh.face.T
-    across, down = (each * jnp.sign(q) for each in (x, y))
+    across, down = (coordinate * jnp.sign(q) for coordinate in (x, y))
     first, second = (across[b] - across[a], down[b] - down[a]), (across[c] - across[a], down[c] - down[a])
     area = first[0] * second[1] - first[1] * second[0]
     scale = 1 / jnp.where(jnp.abs(area) > _EDGE_ON, area, _EDGE_ON)
@@ -92,7 +92,7 @@ def uneven(mesh: Mesh, camera: Camera, curvature: Float[Array, " v"]) -> Bool[Ar
     def square(value: Array) -> Array:
         """Squared change of a value per pixel, summed over the horizontal and the vertical direction."""
         value = value.reshape(len(value), -1)
-        one, other = (value[each] - value[a] for each in (b, c))
+        one, other = (value[corner] - value[a] for corner in (b, c))
         right = (one * second[1][:, None] - other * first[1][:, None]) * scale[:, None]
         below = (other * first[0][:, None] - one * second[0][:, None]) * scale[:, None]
         return jnp.sum(right**2 + below**2, -1)

@@ -58,7 +58,7 @@ class ExactPixels(NamedTuple):
         error = float(relative_l2(scale * row, scale * right))
         if not 0 < error < np.inf:
             return error, 0.0
-        off, size = (np.sum(each**2, 1) for each in (row - right, right))
+        off, size = (np.sum(color**2, 1) for color in (row - right, right))
         spread = np.sqrt(np.sum(self.weight * (self.weight - 1) * (off - error**2 * size) ** 2))
         return error, float(spread / np.sum(self.weight * size) / (2 * error))
 
@@ -106,27 +106,27 @@ def exact_pixels(
             raises an exception, the computation stops.
     """
     scene, camera = _near(scene, camera)
-    mesh, lights = scene.mesh, Environment(jnp.stack([each.radiance for each in environments]))
+    mesh, lights = scene.mesh, Environment(jnp.stack([light.radiance for light in environments]))
     fine = dataclasses.replace(camera, width=_SIDE * camera.width, height=_SIDE * camera.height)
     shown = {"hidden": _hidden_faces(scene, mesh), "occluder": None if mesh.opacity is None else Occluder(mesh)}
     fragments = finished(nearest_fragments(mesh, fine, **shown), between)
-    every = fragments.triangle, fragments.barycentric, front(fragments, mesh, fine)
-    triangle, barycentric, seen = (_squares(np.asarray(each)) for each in every)
+    columns = fragments.triangle, fragments.barycentric, front(fragments, mesh, fine)
+    triangle, barycentric, seen = (_squares(np.asarray(column)) for column in columns)
     region = np.asarray(mesh.region)[np.asarray(mesh.face)[:, 0]]
     owner = np.where(triangle >= 0, region[triangle], -1)
     shown = owner[:, owner.shape[1] // 2 + _SIDE // 2]
-    pixel, weight = _chosen(shown, len(scene.parts), pixels, importance)
+    pixel, weight = _choose_pixels(shown, len(scene.parts), pixels, importance)
     triangle, barycentric, seen, owner = triangle[pixel], barycentric[pixel], seen[pixel], owner[pixel]
     way = jnp.asarray(_squares(np.asarray(raster.ray_direction(fine)))[pixel])
     angle = _squares(pixel_angle(fine))[pixel]
-    behind = np.stack([environment.sky(each, way, angle=angle) for each in environments])
+    behind = np.stack([environment.sky(light, way, angle=angle) for light in environments])
     mean = np.where((owner < 0)[..., None], behind, 0).mean(2)
     lamps = exact_lamps.Lamps.of(scene, shadings)
     half = np.zeros_like(mean)
     first = 0
     for number, (part, shading) in enumerate(zip(scene.parts, shadings, strict=True)):
-        own = (owner == number) & seen
-        row, place = np.nonzero(_some(own, points))
+        covered = (owner == number) & seen
+        row, place = np.nonzero(_choose_places(covered, points))
         face = np.asarray(mesh.face) - first
         first += len(part.mesh.position)
         if not len(row):
@@ -137,14 +137,14 @@ def exact_pixels(
         value = _sum(shading.mesh, brdf, lights, where, **options).astype(np.float64)
         value = value + lamps.at_points(shading.mesh, brdf, where, jnp.asarray(camera.eye))
         value = value if emitted is None else value + np.asarray(emitted)
-        share = own.mean(1)[:, None]
+        share = covered.mean(1)[:, None]
         half_of = _halves(row, place)
         both = [share * _mean(value[:, half_of == side], row[half_of == side], len(pixel)) for side in (0, 1)]
         whole = share * _mean(value, row, len(pixel))
         mean = mean + whole
         alone = np.bincount(row, minlength=len(pixel))[:, None] < 2
-        half = half + np.where(alone, whole * (own.sum(1) > 1)[:, None], (both[0] - both[1]) / 2)
-    norm, error = (np.sqrt(np.einsum("lnc,n->l", each**2, weight)) for each in (mean, half))
+        half = half + np.where(alone, whole * (covered.sum(1) > 1)[:, None], (both[0] - both[1]) / 2)
+    norm, error = (np.sqrt(np.einsum("lnc,n->l", color**2, weight)) for color in (mean, half))
     return ExactPixels(pixel, shown[pixel], mean, weight, error / np.where(norm > 0, norm, 1))
 
 
@@ -179,18 +179,18 @@ def exact_picture(
     if most < 1:
         raise ValueError(f"most must be at least 1 point, got {most}")
     asked, (scene, camera) = camera, _near(scene, camera)
-    shown = finished(_Shown.of(scene, camera), between)
+    shown = finished(_PicturePoints.of(scene, camera), between)
     tilted = [getattr(part.material, "normal_texture", None) is not None for part in scene.parts]
     lamps = exact_lamps.Lamps.of(scene, shadings)
     interpolated = [not lamps.lamp and not normal_map for normal_map in tilted]
-    smooth = [_is_smooth(each, shown, number) and interpolated[number] for number, each in enumerate(shadings)]
-    count = sum(np.count_nonzero(shown.owner == number) for number, each in enumerate(smooth) if not each)
+    smooth = [_is_smooth(shading, shown, part) and interpolated[part] for part, shading in enumerate(shadings)]
+    count = np.count_nonzero(np.isin(shown.owner, np.flatnonzero(np.logical_not(smooth))))
     if count > most:
         step = math.ceil(math.sqrt(count / most))
         size = {"width": max(camera.width // step, 1), "height": max(camera.height // step, 1)}
         camera = dataclasses.replace(camera, **size)
-        shown = _Shown.of(scene, camera)
-    lights = Environment(jnp.stack([each.radiance for each in environments]))
+        shown = _PicturePoints.of(scene, camera)
+    lights = Environment(jnp.stack([light.radiance for light in environments]))
     # Surfaces and lamps may have colors where the light is gray.
     color, colors = np.zeros((len(environments), len(shown.owner), 3), np.float32), lights.radiance.shape[-1]
     options = {"eye": camera.eye, "occluder": scene.mesh, "progress": progress, "between": between}
@@ -201,10 +201,10 @@ def exact_picture(
         points = shown.points(index, number)
         if smooth[number]:
             vertex = np.unique(points.corner)
-            every = np.zeros((len(color), len(part.mesh.position), 3), color.dtype)
-            every[:, vertex] = _sum(shading.mesh, shading.brdf, lights, vertex, **options)
+            at_vertices = np.zeros((len(color), len(part.mesh.position), 3), color.dtype)
+            at_vertices[:, vertex] = _sum(shading.mesh, shading.brdf, lights, vertex, **options)
             look = at_points(part, shading, None, points)
-            value, emitted = points.carry(jnp.asarray(every), axis=1), look.emitted
+            value, emitted = points.carry(jnp.asarray(at_vertices), axis=1), look.emitted
             value = value if look.blend is None else value * look.blend.weight[:, 0]
         else:
             brdf, emitted, points = exact_at(part, shading, points)
@@ -241,25 +241,23 @@ def _sum(
 ) -> np.ndarray:
     """`reference.radiance` at points, or at the vertices of some indices, on all cores."""
 
-    def some(number: int, own: np.ndarray) -> np.ndarray:
-        told, model = progress and number == 0, brdf
+    def radiance(number: int, index: np.ndarray) -> np.ndarray:
+        model, where = brdf, dict(options, progress=progress and number == 0)
         if isinstance(place, Points):
-            where: dict[str, Any] = {
-                "points": jax.tree.map(lambda each: jnp.asarray(np.asarray(each)[..., own]), place)
-            }
-            model = PerVertex(brdf.of(jnp.asarray(own))) if isinstance(brdf, PerVertex) else brdf
+            where["points"] = jax.tree.map(lambda column: jnp.asarray(np.asarray(column)[..., index]), place)
+            model = PerVertex(brdf.of(jnp.asarray(index))) if isinstance(brdf, PerVertex) else brdf
         else:
-            where = {"vertex": place[own]}
-        return np.asarray(reference.radiance(mesh, model, lights, progress=told, **where, **options))
+            where["vertex"] = place[index]
+        return np.asarray(reference.radiance(mesh, model, lights, **where))
 
     count = len(place)
     parts = np.array_split(np.arange(count), min(blocks.cores(), max(count // 64, 1)))
     # The threads of NumPy's matrix products would busy-wait.
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(len(parts)) as pool:
-        return np.concatenate(list(pool.map(some, range(len(parts)), parts)), 1)
+        return np.concatenate(list(pool.map(radiance, range(len(parts)), parts)), 1)
 
 
-class _Shown(NamedTuple):
+class _PicturePoints(NamedTuple):
     """What a picture shows.
 
     Attributes:
@@ -275,37 +273,37 @@ class _Shown(NamedTuple):
     first: Int[np.ndarray, " n"]
 
     @classmethod
-    def of(cls, scene: Scene, camera: Camera) -> "_Shown":
+    def of(cls, scene: Scene, camera: Camera) -> "_PicturePoints":
         mesh = scene.mesh
         occluder = None if mesh.opacity is None else Occluder(mesh)
         pixels = visible_points(mesh, camera, samples=4, hidden=_hidden_faces(scene, mesh), occluder=occluder)
-        region, face, triangle = (np.asarray(each) for each in (mesh.region, mesh.face, pixels.triangle))
+        region, face, triangle = (np.asarray(column) for column in (mesh.region, mesh.face, pixels.triangle))
         owner = np.where(triangle >= 0, region[face[triangle, 0]], -1)
         return cls(pixels, owner, face, np.cumsum([0, *scene.counts])[:-1])
 
     def points(self, index: Int[np.ndarray, " m"], part: int) -> Points:
         """The points of some indices, all of one part."""
         corner = self.face[np.asarray(self.pixels.triangle)[index]] - self.first[part]
-        weight, slope = (np.asarray(each)[index] for each in (self.pixels.barycentric, self.pixels.slope))
+        weight, slope = (np.asarray(column)[index] for column in (self.pixels.barycentric, self.pixels.slope))
         return Points(*map(jnp.asarray, (corner.T, weight.T, np.moveaxis(slope, 0, -1))))
 
 
-def _is_smooth(shading: Shading, shown: _Shown, part: int) -> bool:
+def _is_smooth(shading: Shading, shown: _PicturePoints, part: int) -> bool:
     """Whether to sum the radiance of a part at its vertices: it is Lambertian, and its vertices are dense enough."""
     index = np.flatnonzero(shown.owner == part)
     vertices = len(np.unique(shown.face[np.asarray(shown.pixels.triangle)[index]]))
     return shading.matte and vertices <= len(index) <= _COARSE * vertices
 
 
-def _some(own: np.ndarray, count: int) -> np.ndarray:
-    """Chooses at most `count` places in each row at random, spread over the quarters of the pixel."""
+def _choose_places(covered: np.ndarray, count: int) -> np.ndarray:
+    """Chooses at most `count` covered places in each row at random, spread over the quarters of the pixel."""
     random = np.random.default_rng(1)
     half = _SIDE // 2
-    turn = random.random((len(own), 2, 2, half * half)).argsort(-1).reshape(len(own), 2, 2, half, half)
-    order = turn.swapaxes(2, 3).reshape(own.shape) + random.random(own.shape)
-    order = np.where(own, order, np.inf)
-    least = np.sort(order, 1)[:, min(count, own.shape[1]) - 1]
-    return own & (order <= least[:, None])
+    turn = random.random((len(covered), 2, 2, half * half)).argsort(-1).reshape(len(covered), 2, 2, half, half)
+    order = turn.swapaxes(2, 3).reshape(covered.shape) + random.random(covered.shape)
+    order = np.where(covered, order, np.inf)
+    least = np.sort(order, 1)[:, min(count, covered.shape[1]) - 1]
+    return covered & (order <= least[:, None])
 
 
 def _halves(row: Int[np.ndarray, " m"], place: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
@@ -330,27 +328,27 @@ def _mean(value: Float[np.ndarray, "l m c"], row: np.ndarray, rows: int) -> Floa
 def _squares(fine: np.ndarray) -> np.ndarray:
     """Groups the values of a fine picture [h w *c] by coarse pixels: [pixel, place, *c]."""
     rows, columns = fine.shape[0] // _SIDE, fine.shape[1] // _SIDE
-    each = fine.reshape(rows, _SIDE, columns, _SIDE, *fine.shape[2:]).swapaxes(1, 2)
-    return each.reshape(rows * columns, _SIDE**2, *fine.shape[2:])
+    squares = fine.reshape(rows, _SIDE, columns, _SIDE, *fine.shape[2:]).swapaxes(1, 2)
+    return squares.reshape(rows * columns, _SIDE**2, *fine.shape[2:])
 
 
-def _chosen(
+def _choose_pixels(
     shown: Int[np.ndarray, " p"], parts: int, count: int | None, importance: ArrayLike | None
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """The chosen pixels among those that show parts, and the number of pixels that each represents."""
-    every = np.flatnonzero(shown >= 0)
-    if count is None or count >= len(every):
-        return every, np.ones(len(every))
+    visible = np.flatnonzero(shown >= 0)
+    if count is None or count >= len(visible):
+        return visible, np.ones(len(visible))
     random = np.random.default_rng(0)
     if importance is None:
-        each = [random.permutation(np.flatnonzero(shown == number))[: -(-count // parts)] for number in range(parts)]
-        pixel = np.sort(np.concatenate(each))
-        share = np.bincount(shown[every], minlength=parts) / np.maximum(np.bincount(shown[pixel], minlength=parts), 1)
+        of_part = [random.permutation(np.flatnonzero(shown == part))[: -(-count // parts)] for part in range(parts)]
+        pixel = np.sort(np.concatenate(of_part))
+        share = np.bincount(shown[visible], minlength=parts) / np.maximum(np.bincount(shown[pixel], minlength=parts), 1)
         return pixel, share[shown[pixel]]
-    chance = np.ravel(importance).astype(np.float64)[every]
+    chance = np.ravel(importance).astype(np.float64)[visible]
     chance = chance * count / chance.sum()
     while np.any(chance > 1):
         sure = chance >= 1
         chance = np.where(sure, 1, chance * (count - sure.sum()) / chance[~sure].sum())
-    taken = random.random(len(every)) < chance
-    return every[taken], 1 / chance[taken]
+    chosen = random.random(len(visible)) < chance
+    return visible[chosen], 1 / chance[chosen]

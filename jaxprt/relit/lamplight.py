@@ -78,17 +78,17 @@ class LampLight:
             on_group: The same points on the group.
         """
         surface, index = self.stage.surfaces[number], np.asarray(index)
-        own = np.maximum(index, 0)
+        point = np.maximum(index, 0)
         with compile_time(surface.position, surface.frame, on_group):
             position, frame = placed(surface.position, surface.frame, on_group)
-        pixel = np.asarray(self.pixels.pixel)[own]
-        triangle = np.where(index < 0, -1, np.asarray(self.pixels.triangle)[own])
-        barycentric, slope = (np.asarray(each)[own] for each in (self.pixels.barycentric, self.pixels.slope))
+        pixel = np.asarray(self.pixels.pixel)[point]
+        triangle = np.where(index < 0, -1, np.asarray(self.pixels.triangle)[point])
+        barycentric, slope = (np.asarray(column)[point] for column in (self.pixels.barycentric, self.pixels.slope))
         points = picture_rays.PicturePoints(triangle, barycentric, slope, pixel // self.width, pixel % self.width)
         fields = np.asarray(position), np.asarray(frame)[:, 2]
-        own_places = self._places_for(number)
-        moment = picture_rays.moments(self._caster.occluder, self._caster.mesh, points, *fields, own_places)
-        return at_points(moment, position, frame, self._sources, own_places.pieces)
+        lamp_places = self._places_for(number)
+        moment = picture_rays.moments(self._caster.occluder, self._caster.mesh, points, *fields, lamp_places)
+        return at_points(moment, position, frame, self._sources, lamp_places.pieces)
 
 
 def of(stage: Stage, pixels: Pixels, width: int) -> LampLight | None:
@@ -101,4 +101,4 @@ def of(stage: Stage, pixels: Pixels, width: int) -> LampLight | None:
     """
     if stage.power is None or not known(stage.whole, stage.power, stage.point_lights, pixels):
         return None
-    return LampLight(stage, pixels, width) if known([each.position for each in stage.surfaces]) else None
+    return LampLight(stage, pixels, width) if known([surface.position for surface in stage.surfaces]) else None

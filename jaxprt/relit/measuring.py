@@ -25,7 +25,7 @@ from jaxprt.scene.mesh import bounds
 from jaxprt.scene.scene import centered
 from jaxprt.systems import protocol, reference
 
-JUDGED = 1350  # number of points, of all parts together, whose exact radiance is computed
+POINTS = 1350  # number of points, of all parts together, whose exact radiance is computed
 FEWEST = 100  # smallest number of points of one part
 _PICTURE = 192  # edge of the measured pictures in pixels
 _PIXELS = 120  # number of pixels that are measured in each picture
@@ -74,9 +74,9 @@ class Report(NamedTuple):
     def __str__(self) -> str:
         """The table, with one row for each part."""
         rows = [
-            f"{each.name}: {each.vertices} vertices, {each.nbytes / 1e6:.2f} MB, pixels off by "
-            f"{_percent(each.errors)}, vertices by {_percent(each.vertex_errors)}"
-            for each in self.part
+            f"{part.name}: {part.vertices} vertices, {part.nbytes / 1e6:.2f} MB, pixels off by "
+            f"{_percent(part.errors)}, vertices by {_percent(part.vertex_errors)}"
+            for part in self.part
         ]
         rows.append(f"pictures off by {_percent(self.errors)}, measured to {_percent(self.uncertainty)}")
         rows.append(f"visibility between vertices off by {_percent([self.interpolation_error])}")
@@ -85,7 +85,7 @@ class Report(NamedTuple):
 
 
 def _percent(errors: Sequence[float]) -> str:
-    return ", ".join("-" if math.isnan(each) else f"{100 * each:.1f} %" for each in errors)
+    return ", ".join("-" if math.isnan(error) else f"{100 * error:.1f} %" for error in errors)
 
 
 def measure(scene: Any, environments: Sequence[Environment]) -> Report:
@@ -95,27 +95,27 @@ def measure(scene: Any, environments: Sequence[Environment]) -> Report:
         scene: The relit scene, with its origin at zero. Times and bytes include bounces; errors are of direct light.
         environments: Environments of one size.
     """
-    size, mesh, shadings = checked(environments, 1.0, 1.0), scene.mesh, scene.shading
+    size, mesh, shadings = check_lights(environments, 1.0, 1.0), scene.mesh, scene.shading
     lamps = Lamps.of(centered(scene.scene), shadings)
     direct, views = scene.without_bounces(), views_around(mesh)
     seen = [direct.view(jnp.asarray(eye)) for eye in views]
-    lit = [direct.shade(direct.light(each)) for each in environments]
+    lit = [direct.shade(direct.light(light)) for light in environments]
     color = np.stack([[np.asarray(direct.combine(light, view)) for view in seen] for light in lit])
     pixels = _pictures(direct.picture, scene.camera, scene.scene, shadings, environments)
     parts, first = [], 0
     for number, (part, shading) in enumerate(zip(scene.scene.parts, shadings, strict=True)):
         count = len(part.mesh.position)
-        few = max(FEWEST, round(JUDGED * count / len(mesh.position)))
+        few = max(FEWEST, round(POINTS * count / len(mesh.position)))
         vertex = np.sort(np.random.default_rng(1).permutation(count)[:few])
         visible = visibility.precompute(
             shading.mesh, size=size, occluder=mesh, vertex=vertex, run=visibility.Run(progress=False)
         )
-        judged = np.arange(len(vertex))
+        index = np.arange(len(vertex))
         brdf = exact_brdf(shading, vertex)
-        exact = _exact(visible, judged, brdf, environments, views)
+        exact = _exact(visible, index, brdf, environments, views)
         if lamps.lamp:
             exact += np.stack([lamps.at_vertices(shading.mesh, brdf, vertex, jnp.asarray(eye)) for eye in views])
-        facing, now = _facing(visible, judged, views), color[:, :, first + vertex]
+        facing, now = _facing(visible, index, views), color[:, :, first + vertex]
         if shading.emitted is not None:
             now = now - np.asarray(shading.emitted)[vertex]
         pairs = zip(np.broadcast_to(now, exact.shape), exact, strict=True)
@@ -144,15 +144,15 @@ def _pictures(picture, camera, scene, shadings, environments) -> tuple[np.ndarra
     """Errors of pictures [light], errors of their parts [light, part], and errors of the reference pixels [light]."""
     around = [orbit(scene.mesh, azimuth=turn, elevation=0.4) for turn in (2.2, 4.4)]
     wrong, right, unsure = (np.zeros((len(environments), len(scene.parts))) for _ in range(3))
-    for each in (camera, *around):
-        small = dataclasses.replace(each, width=_PICTURE, height=_PICTURE)
+    for view in (camera, *around):
+        small = dataclasses.replace(view, width=_PICTURE, height=_PICTURE)
         exact = exact_pixels(scene, shadings, environments, small, pixels=_PIXELS)
         for number, light in enumerate(environments):
             off = np.asarray(picture(light, small)).reshape(_PICTURE**2, -1)[exact.pixel] - exact.color[number]
             for part in range(len(scene.parts)):
-                own = exact.part == part
-                wrong[number, part] += np.sum(off[own] ** 2)
-                right[number, part] += np.sum(exact.color[number][own] ** 2)
+                pixel = exact.part == part
+                wrong[number, part] += np.sum(off[pixel] ** 2)
+                right[number, part] += np.sum(exact.color[number][pixel] ** 2)
             unsure[number, 0] += exact.error[number] ** 2 * np.sum(exact.color[number] ** 2)
     whole = np.maximum(right.sum(1), np.finfo(float).tiny)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -165,7 +165,7 @@ def lights_of(scene: Scene) -> tuple[Environment, ...]:
     return scene.environments or (builtin.daylight(), builtin.studio())
 
 
-def checked(environments: Sequence[Environment], error: float, rate: float) -> int:
+def check_lights(environments: Sequence[Environment], error: float, rate: float) -> int:
     """Refuses invalid environments, errors and frame rates; returns the edge of the environments' faces in texels."""
     if not isinstance(environments, Sequence) or isinstance(environments, str | bytes):
         raise TypeError(f"environments must be a list of lights, got one {type(environments).__name__}")
@@ -193,15 +193,15 @@ def views_around(mesh: Mesh) -> Float[np.ndarray, "w 3"]:
     return ((low + high) / 2 + 1.6 * np.linalg.norm(high - low) * around).astype(np.float32)
 
 
-def _facing(visible, judged: np.ndarray, views: np.ndarray) -> np.ndarray:
+def _facing(visible, index: np.ndarray, views: np.ndarray) -> np.ndarray:
     """Which of some vertices face each view, [view, vertex]."""
-    normal, position = np.asarray(visible.frame)[judged, 2], np.asarray(visible.position)[judged]
+    normal, position = np.asarray(visible.frame)[index, 2], np.asarray(visible.position)[index]
     return np.einsum("vi,wvi->wv", normal, views[:, None] - position) > 0
 
 
 def relative_error(now: np.ndarray, exact: np.ndarray) -> float:
     """Relative L2 error; infinite if the value contains NaN."""
-    wrong, whole = (float(np.linalg.norm(each)) for each in (now - exact, exact))
+    wrong, whole = (float(np.linalg.norm(color)) for color in (now - exact, exact))
     return float(np.nan_to_num(wrong, nan=np.inf)) / (whole if whole > 0 else 1.0)
 
 
@@ -211,12 +211,11 @@ def exact_brdf(shading: Shading, vertex: np.ndarray) -> Callable:
     return PerVertex(exact.of(jnp.asarray(vertex))) if isinstance(exact, PerVertex) else grid.as_argument(exact)
 
 
-def _exact(visible, judged: np.ndarray, brdf: Callable, environments, views: np.ndarray) -> np.ndarray:
+def _exact(visible, index: np.ndarray, brdf: Callable, environments, views: np.ndarray) -> np.ndarray:
     """Radiance [light, view, vertex, color] of some vertices, summed over all texels."""
     batch = Environment(jnp.stack([light.radiance for light in environments]))
-    seen, position, frame = jnp.asarray(visible.seen(judged)), visible.position[judged], visible.frame[judged]
-    each = [reference.integrate(seen, position, frame, brdf, batch, jnp.asarray(eye)) for eye in views]
-    exact = np.stack(each, 1)
+    seen, position, frame = jnp.asarray(visible.seen(index)), visible.position[index], visible.frame[index]
+    exact = np.stack([reference.integrate(seen, position, frame, brdf, batch, jnp.asarray(eye)) for eye in views], 1)
     require.finite("the radiance that the BRDF reflects, by light, view, vertex and color,", exact)
     return exact
 

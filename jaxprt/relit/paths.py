@@ -6,6 +6,7 @@ table of their weights over roughness.
 """
 
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -54,37 +55,36 @@ def factored(shading: Shading) -> Path:
     """
     if shading.table is not None:
         return _standard(shading.table)
-    return _factored(still(shading), shading.brdf, shading.knot if shading.blend is not None else ())
+    return _factor(still(shading), shading.brdf, shading.knot if shading.blend is not None else ())
 
 
 @functools.cache
 def _standard(table: StandardTable) -> Path:
     if table != standard.BLINN_PHONG:
         return Path(*table.paths())
-    return _factored(table.family, table.family, table.knots)
+    return _factor(table.family, table.family, table.knots)
 
 
-def _factored(alone: Callable, brdf: Callable, knot: tuple[np.ndarray, ...]) -> Path:
+def _factor(alone: Callable, brdf: Callable, knot: tuple[np.ndarray, ...]) -> Path:
     """The factored BRDF of a family over roughness, or of one BRDF; `alone` is it at one roughness."""
     knot = _finer(knot)
-    members = [brdf(jnp.asarray(each)) for each in knot[0]] if knot else [alone]
+    members = [brdf(jnp.asarray(value)) for value in knot[0]] if knot else [alone]
     matte = _matte(members[0])
     if matte is None or matte.all():
-        return Path(_alone(alone), None)
-    wide = [_lobes(each, ~matte) for each in members]
+        return Path(_factor_channels(alone), None)
+    wide = [_lobes(member, ~matte) for member in members]
     # Lobes that are widened to the same width become one member of the set.
     first = [0] + [n for n in range(1, len(wide)) if not _equal(wide[n - 1], wide[n])]
     lobes = [wide[n] for n in first]
     shared, weight = bounces.functions.shared(lobes, functions=_FUNCTIONS, terms=_TERMS, resolution=_RESOLUTION)
-    own = np.searchsorted(first, np.arange(len(wide)), side="right") - 1
+    index = np.searchsorted(first, np.arange(len(wide)), side="right") - 1
     factor = np.zeros((len(members), len(matte), shared.view_map.shape[-1]), np.asarray(weight).dtype)
-    factor[:, ~matte] = np.asarray(weight)[own]
+    factor[:, ~matte] = np.asarray(weight)[index]
     factor[:, matte, -1] = 1
-    kept = factor @ np.asarray(bounces.functions.albedo(shared))
-    true = np.stack([channels(each) for each in members])
-    factor *= np.where(kept > _DARK, true / np.maximum(kept, _DARK), 1)[..., None]
+    exact = np.stack([channels(member) for member in members])
+    factor *= _ratio(exact, factor @ np.asarray(bounces.functions.albedo(shared)))[..., None]
     dtype = shared.view_map.dtype
-    return Path(shared, FunctionWeights(tuple(jnp.asarray(each, dtype) for each in knot), jnp.asarray(factor, dtype)))
+    return Path(shared, FunctionWeights(tuple(jnp.asarray(row, dtype) for row in knot), jnp.asarray(factor, dtype)))
 
 
 def typical(shading: Shading, path: Path) -> Float[Array, "p c"] | None:
@@ -115,7 +115,7 @@ def still(shading: Shading) -> Callable:
     if not shading.knot:
         return shading.brdf
     assert shading.blend is not None
-    return shading.brdf(*(jnp.asarray(np.mean(each)) for each in shading.blend.parameter))
+    return shading.brdf(*(jnp.asarray(np.mean(row)) for row in shading.blend.parameter))
 
 
 def widened(brdf: Callable) -> Callable:
@@ -131,13 +131,18 @@ def _widens(part: Any) -> bool:
     return hasattr(part, "widened")
 
 
-def _alone(brdf: Callable) -> separable.SeparableBrdf:
+def _factor_channels(brdf: Callable) -> separable.SeparableBrdf:
     """The factored BRDF of a part whose BRDF has its own channels."""
     terms = 1 if getattr(brdf, "matte", False) else _TERMS
-    made = separable.factor(widened(brdf), terms=terms, resolution=_RESOLUTION)
-    kept = np.atleast_1d(bounces.functions.albedo(made))
-    scale = np.where(kept > _DARK, channels(brdf) / np.maximum(kept, _DARK), 1)
-    return eqx.tree_at(lambda each: each.view_map, made, made.view_map * jnp.asarray(scale, made.view_map.dtype))
+    result = separable.factor(widened(brdf), terms=terms, resolution=_RESOLUTION)
+    scale = _ratio(channels(brdf), np.atleast_1d(bounces.functions.albedo(result)))
+    view_map = result.view_map * jnp.asarray(scale, result.view_map.dtype)
+    return eqx.tree_at(lambda brdf: brdf.view_map, result, view_map)
+
+
+def _ratio(exact: np.ndarray, albedo: np.ndarray) -> np.ndarray:
+    """Factor that gives functions their exact albedo; 1 for dark ones."""
+    return np.where(albedo > _DARK, exact / np.maximum(albedo, _DARK), 1)
 
 
 def _finer(knot: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
@@ -158,8 +163,8 @@ def _matte(brdf: Callable) -> np.ndarray | None:
 def _lobes(brdf: Callable, which: np.ndarray) -> Callable:
     """The selected channels, widened and without their scales."""
     assert isinstance(brdf, Channels)
-    kept = tuple(each for each, own in zip(brdf.model, which, strict=True) if own)
-    return widened(Channels(kept, jnp.ones(len(kept), brdf.scale.dtype)))
+    models = tuple(itertools.compress(brdf.model, which))
+    return widened(Channels(models, jnp.ones(len(models), brdf.scale.dtype)))
 
 
 def _equal(one: Callable, other: Callable) -> bool:

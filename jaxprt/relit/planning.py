@@ -21,7 +21,7 @@ from jaxprt import require
 from jaxprt.compile import promoted
 from jaxprt.files import objects
 from jaxprt.relit import channels, groups, refinement, reflection, registry
-from jaxprt.relit.measuring import checked, lights_of, views_around
+from jaxprt.relit.measuring import check_lights, lights_of, views_around
 from jaxprt.relit.recipes import Lobes, Recipe, Terms
 from jaxprt.relit.sampling import Candidate, Sample
 from jaxprt.scene import Environment, Scene, sides
@@ -163,7 +163,7 @@ def plan(
     run = Run(path, progress=progress)
     named, environments = environments, lights_of(scene) if environments is None else environments
     asked = ERROR if error is None else error
-    size, key = checked(environments, asked, rate), key_of(centered(scene), environments)
+    size, key = check_lights(environments, asked, rate), key_of(centered(scene), environments)
     options = {"vertices": None, "environments": named, "folder": None, "progress": progress}
     scene = centered(refinement.divided(sides.two_sided(scene), refine, **options)[0])
     mesh, views = scene.mesh, views_around(scene.mesh)

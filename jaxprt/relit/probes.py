@@ -47,7 +47,7 @@ def sample(
     if place.ndim != 2 or place.shape[1] != 3:
         raise ValueError(f"positions must be [p, 3], got {list(place.shape)}")
     require.finite("the positions", place)
-    return [Environment(jnp.stack(_faces(scene, environment, each, materials, size))) for each in place]
+    return [Environment(jnp.stack(_faces(scene, environment, point, materials, size))) for point in place]
 
 
 def _faces(scene: RelitScene, environment: Environment, place: np.ndarray, materials: Any, size: int) -> Sequence:

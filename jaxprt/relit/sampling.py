@@ -15,7 +15,7 @@ from jaxprt.brdf import grid
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.relit import channels, groups
 from jaxprt.relit.channels import Shading
-from jaxprt.relit.measuring import FEWEST, JUDGED, relative_error, seconds
+from jaxprt.relit.measuring import FEWEST, POINTS, relative_error, seconds
 from jaxprt.relit.recipes import Known, Recipe, Target
 from jaxprt.scene import Environment, Mesh, Part
 from jaxprt.scene.mesh import frames
@@ -116,14 +116,14 @@ class Sample:
         quiet, start = Run(progress=False), time.perf_counter()
         visible = visibility.precompute(mesh, size=size, occluder=scene, vertex=vertex, run=quiet)
         seconds = time.perf_counter() - start
-        few = max(FEWEST, round(JUDGED * count / total))
+        few = max(FEWEST, round(POINTS * count / total))
         points = _scattered(mesh, vertex, few)
         target = Target(scene, size=size, vertex=vertex, known=Known(visible), run=quiet)
         whole = Points(jnp.asarray(vertex)[points.corner], points.weight)
         blend, brdf = channels.materials_at(parts, shading, whole)
         level = points.carry(jnp.asarray(visible.seen(np.arange(len(vertex))), jnp.float32))
         seen = np.asarray(jnp.round(level)).astype(np.uint8)
-        facing, exact, mesh_error = _judged(mesh, brdf, whole, seen, scene, environments, views)
+        facing, exact, mesh_error = _exact(mesh, brdf, whole, seen, scene, environments, views)
         ratio, lights = count / len(vertex), tuple(environments)
         return cls(shading, target, ratio, points, blend, facing, exact, mesh_error, lights, views, seconds)
 
@@ -147,7 +147,7 @@ class Sample:
         start = time.perf_counter()
         system = recipe.make(self.shading, self.target)
         seconds = self.vertex_ratio * (self.rays_seconds + time.perf_counter() - start)
-        wrong = max(self._error(system, *each) for each in zip(self.environments, self.exact, strict=True))
+        wrong = max(self._error(system, *pair) for pair in zip(self.environments, self.exact, strict=True))
         return Candidate(recipe, wrong, self._frame(system), _bytes(system, self.vertex_ratio), seconds)
 
     def _error(self, system: System, light: Environment, exact: np.ndarray) -> float:
@@ -161,7 +161,7 @@ class Sample:
         """Seconds of a frame of the whole part. The time of a light that all vertices share is not scaled."""
         light, eye = self.environments[0], jnp.asarray(self.views[0])
         whole, vertex = self.shading.blend, self.target.vertex
-        blend = None if whole is None else jax.tree.map(lambda each: each[vertex], whole)
+        blend = None if whole is None else jax.tree.map(lambda column: column[vertex], whole)
         lit, view = system.light(light), system.view(eye, blend)
         once = seconds(lambda: system.light(light))
         rest = seconds(lambda: system.view(eye, blend)) + seconds(lambda: system.combine(lit, view))
@@ -187,18 +187,18 @@ def _scattered(mesh: Mesh, vertex: np.ndarray, count: int) -> Points:
     return Points(jnp.asarray(corner[chosen].T), jnp.asarray(weight.T))
 
 
-def _judged(
+def _exact(
     mesh: Mesh,
     brdf: Callable,
     points: Points,
-    told: np.ndarray,
+    visible: np.ndarray,
     scene: Mesh,
     environments: Sequence[Environment],
     views: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Which points face each view, their radiance [light, view, point, color], and the error of the visibility `told`.
+    """Which points face each view, their radiance [light, view, point, color], and the error of `visible`.
 
-    The error is the relative L2 difference between radiance with the visibility `told` and radiance with rays traced
+    The error is the relative L2 difference between radiance with the visibility `visible` and radiance with rays traced
     from the points, under the worst light.
     """
     position, frame = placed(mesh.position, jnp.asarray(frames(mesh.normal, mesh.tangent)), points)
@@ -211,10 +211,10 @@ def _judged(
     traced, _ = visibility.fractional(rays, start, normal, size=batch.radiance.shape[-2])
 
     def radiance(seen: np.ndarray) -> np.ndarray:
-        each = [reference.integrate(jnp.asarray(seen), position, frame, brdf, batch, jnp.asarray(eye)) for eye in views]
-        return np.stack(each, 1)
+        integrand = jnp.asarray(seen), position, frame, brdf, batch
+        return np.stack([reference.integrate(*integrand, jnp.asarray(eye)) for eye in views], 1)
 
-    exact, true = radiance(told), radiance(traced)
+    exact, true = radiance(visible), radiance(traced)
     require.finite("the radiance that the BRDF reflects, by light, view, point and color,", exact)
     return facing, exact, max(relative_error(a[facing], b[facing]) for a, b in zip(exact, true, strict=True))
 

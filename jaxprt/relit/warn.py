@@ -40,13 +40,13 @@ def of_backs(scene: Scene, mesh: Mesh, camera: Camera) -> None:
     way = raster.ray_direction(dataclasses.replace(near, width=_RAYS, height=_RAYS))
     way, occluder = np.asarray(way, np.float32).reshape(-1, 3), Occluder(mesh)
     triangle, *_ = occluder.hit(np.tile(np.asarray(near.eye, np.float32), (len(way), 1)), way)
-    met = np.flatnonzero(triangle >= 0)
-    corner = occluder.facing(triangle[met], way[met])
-    away = ~hits_front(occluder, np.asarray(mesh.normal), corner, way[met])
-    own = np.asarray(mesh.region)[corner[:, 0]]
+    hit = np.flatnonzero(triangle >= 0)
+    corner = occluder.facing(triangle[hit], way[hit])
+    away = ~hits_front(occluder, np.asarray(mesh.normal), corner, way[hit])
+    owner = np.asarray(mesh.region)[corner[:, 0]]
     shells = enclosing(scene)
     for number, part in enumerate(scene.parts):
-        seen = away[own == number]
+        seen = away[owner == number]
         if _emits(part) or _lit_behind(part) or len(seen) <= _SMALLEST * len(way) or np.mean(seen) <= 0.5:
             continue
         if number in shells and not _has_lamps(scene):
