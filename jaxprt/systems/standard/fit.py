@@ -42,7 +42,7 @@ _SENDING = ("metallic_roughness", "cook_torrance")  # materials whose functions 
 _DARK = 1e-6
 
 
-class Material(NamedTuple):
+class StandardMaterial(NamedTuple):
     """What is tabulated.
 
     Attributes:
@@ -71,7 +71,7 @@ class Material(NamedTuple):
         return np.linspace(np.log(self.smoothest), 0, self.knot_count)
 
 
-def material_of(name: str) -> Material:
+def material_of(name: str) -> StandardMaterial:
     """The material of a file."""
     random = np.random.default_rng(0)
     base, other = random.uniform(0.05, 1, (2, 60, 1)).astype(np.float32)
@@ -79,15 +79,19 @@ def material_of(name: str) -> Material:
         scale = np.array([0.1, 1.0], np.float32)
         # Every other one has no diffuse base.
         weight = np.concatenate([base * (np.arange(60) % 2)[:, None], other], 1) / scale
-        return Material(ShininessFamily(jnp.asarray(scale)), scale, 10**-2.5, weight, 0.1, _spread(10**-2.5, 1), 1)
+        return StandardMaterial(
+            ShininessFamily(jnp.asarray(scale)), scale, 10**-2.5, weight, 0.1, _spread(10**-2.5, 1), 1
+        )
     if name == "cook_torrance":
         scale, f0 = np.array([0.1, 1.0, 1.0], np.float32), np.linspace(0, 1, 60, dtype=np.float32)[:, None]
         rows = [base * (np.arange(60) % 2)[:, None], other * f0, other * (1 - f0)]
         weight = np.concatenate(rows, 1) / scale
-        return Material(SlopeFamily(jnp.asarray(scale)), scale, 10**-2.5, weight, 0.3, _spread(10**-2.5, 1), 1)
+        return StandardMaterial(SlopeFamily(jnp.asarray(scale)), scale, 10**-2.5, weight, 0.3, _spread(10**-2.5, 1), 1)
     if name == "sheen":
         scale, knot = np.ones(1, np.float32), _spread(sheen.SMOOTHEST, 1)
-        return Material(SheenFamily(jnp.asarray(scale)), scale, sheen.SMOOTHEST, base, sheen.SMOOTHEST, knot, 1, FEW)
+        return StandardMaterial(
+            SheenFamily(jnp.asarray(scale)), scale, sheen.SMOOTHEST, base, sheen.SMOOTHEST, knot, 1, FEW
+        )
     scale = np.array([0.1, 1.0, 1.0, 0.02], np.float32)
     metallic, specular = (
         np.resize(values, 60).astype(np.float32) for values in ([0, 0, 1, 1, 0.3, 0.6], [1, 0.6, 1, 1, 0.5])
@@ -95,7 +99,7 @@ def material_of(name: str) -> Material:
     brdf = MetallicRoughness(base_color=base, metallic=metallic, specular=specular)
     weight = np.asarray(brdf.coefficient())[..., 0] / scale
     family = RoughnessFamily((0, 1, 2, 3), jnp.asarray(scale), jnp.zeros(()))
-    return Material(family, scale, 1e-3**0.5, weight, 0.3, _spread(1e-3**0.5, 2), 2)
+    return StandardMaterial(family, scale, 1e-3**0.5, weight, 0.3, _spread(1e-3**0.5, 2), 2)
 
 
 def _spread(smoothest: float, power: int, count: int = 16) -> np.ndarray:
@@ -103,7 +107,7 @@ def _spread(smoothest: float, power: int, count: int = 16) -> np.ndarray:
     return np.log(np.linspace(smoothest ** (power / 2), 1, count)) * 2 / power
 
 
-def lobes(material: Material, count: int) -> dict[str, np.ndarray]:
+def lobes(material: StandardMaterial, count: int) -> dict[str, np.ndarray]:
     """Arrays of a table of lobes: those of the `LobeBrdf`, rounded, and its errors at and halfway between the knots."""
     table = lobe.tabulate(material.family, lobes=count, knot=(material.knots,))
     least = np.stack([_least(material.family(jnp.asarray(knot)), count) for knot in material.knots], 1)
@@ -143,7 +147,7 @@ def errors(
     return np.array([measured_error(family(knot), table.at(knot)) for knot in knots])
 
 
-def harmonics(material: Material) -> dict[str, np.ndarray]:
+def harmonics(material: StandardMaterial) -> dict[str, np.ndarray]:
     """Arrays of the table of harmonics, up to degree 4."""
     table = harmonic.tabulate(material.family, degree=4, error=0.02, resolution=ANGLES, knot=(material.knot,))
     return {
@@ -153,7 +157,7 @@ def harmonics(material: Material) -> dict[str, np.ndarray]:
     }
 
 
-def columns(material: Material, table: LobeBrdf) -> dict[str, np.ndarray]:
+def columns(material: StandardMaterial, table: LobeBrdf) -> dict[str, np.ndarray]:
     """What does not follow the table: curvatures, numbers of samples, and albedos of the traced lobes, at the knots.
 
     A sheen has no numbers of samples: it is dark around the mirror direction, where these are measured, and wide
@@ -177,7 +181,7 @@ def columns(material: Material, table: LobeBrdf) -> dict[str, np.ndarray]:
     return arrays | {"samples": np.array(samples, np.uint8), "samples.knot": place.astype(np.float32)}
 
 
-def tensor(material: Material, table: LobeBrdf) -> dict[str, np.ndarray]:
+def tensor(material: StandardMaterial, table: LobeBrdf) -> dict[str, np.ndarray]:
     """Arrays of the tensor for what the lobes of a table leave, and what its diffuse part is to be changed by."""
     brdf = dynamic.tabulate(material.family, lobes=table, ranks=tables.RANKS, knot=(material.knots,))
     return {
@@ -200,7 +204,7 @@ def _zonal(brdf: Channels) -> Float[np.ndarray, "l k"]:
     return np.polynomial.legendre.legvander(np.clip(wi @ mirror, -1, 1), BANDS).T @ mass
 
 
-def paths(material: Material) -> dict[str, np.ndarray]:
+def paths(material: StandardMaterial) -> dict[str, np.ndarray]:
     """Functions of light paths for all roughnesses, and their weights; see `jaxprt.relit.paths.factored`."""
     scale = np.asarray(material.scale, np.float64)
     matte = np.isin(np.arange(len(scale)), _DIFFUSE)
