@@ -5,6 +5,7 @@ texels, from eight views, under every light. Bytes and times of the sample are s
 """
 
 import math
+import operator
 import os
 import pathlib
 import re
@@ -80,17 +81,17 @@ class Plan(eqx.Module):
     @property
     def error(self) -> float:
         """Predicted relative L2 error of the group with the largest error."""
-        return max(each.chosen.error for each in self.group)
+        return max(group.chosen.error for group in self.group)
 
     @property
     def seconds(self) -> float:
         """Time of a frame with a new light and a new view on this machine, without rasterization."""
-        return sum(each.chosen.seconds for each in self.group)
+        return sum(group.chosen.seconds for group in self.group)
 
     @property
     def nbytes(self) -> int:
         """Size of transport and BRDFs in bytes, without the data of bounces."""
-        return sum(each.chosen.nbytes for each in self.group)
+        return sum(group.chosen.nbytes for group in self.group)
 
     @property
     def recipes(self) -> dict[str, Recipe]:
@@ -103,7 +104,7 @@ class Plan(eqx.Module):
         for group in self.group:
             rows.append(f"{', '.join(group.names)}: {group.vertices} vertices")
             chosen = repr(group.chosen.recipe)  # In a plan loaded from a file, `chosen` is a copy: compare by value.
-            rows += [f"  {'*' if repr(each.recipe) == chosen else ' '} {each}" for each in group.considered]
+            rows += [f"  {'*' if repr(row.recipe) == chosen else ' '} {row}" for row in group.considered]
             advice = "; `jaxprt.refine` divides its triangles" if group.mesh_error > self.asked else ""
             rows.append(f"    {100 * group.mesh_error:.1f} % of shadows between its vertices{advice}")
         for name, (once, twice, often) in zip(self.names, 100 * self.reflected.T, strict=True):
@@ -171,28 +172,28 @@ def plan(
     looks = channels.looks(scene.parts)
     shadings = [channels.of_part(part, look=look) for part, look in zip(scene.parts, looks, strict=True)]
     parts = groups.kinds(shadings, [Lobes()] * len(shadings))
-    for number, own in enumerate(tqdm.tqdm(parts, desc="plan", unit="group", disable=not progress)):
-        members, names = [scene.parts[part] for part in own], tuple(scene.parts[part].name for part in own)
-        sample = Sample.make(members, [shadings[part] for part in own], mesh, total, size, environments, views)
+    for number, group in enumerate(tqdm.tqdm(parts, desc="plan", unit="group", disable=not progress)):
+        members, names = [scene.parts[part] for part in group], tuple(scene.names[part] for part in group)
+        sample = Sample.make(members, [shadings[part] for part in group], mesh, total, size, environments, views)
         count = len(sample.shading.mesh.position)
         alone = None
-        if len(own) == 1:
-            alone = sample.alone(members[0], channels.of_part(members[0], look=looks[own[0]], takes=Terms().takes))
-        considered = tuple(_considered(sample, alone, run.within(f"{key}_{number}"), asked, count / total / rate))
-        good = [each for each in considered if each.error * MARGIN <= asked]
+        if len(group) == 1:
+            alone = sample.alone(members[0], channels.of_part(members[0], look=looks[group[0]], takes=Terms().takes))
+        considered = tuple(_candidates(sample, alone, run.within(f"{key}_{number}"), asked, count / total / rate))
+        good = [candidate for candidate in considered if candidate.error * MARGIN <= asked]
         if not good:
-            best = min(considered, key=lambda each: each.error)
-            _unmet(names, best, error)
+            best = min(considered, key=operator.attrgetter("error"))
+            _report_miss(names, best, error)
             good = [best]
-        fast = [each for each in good if each.seconds <= count / total / rate]
-        chosen = min(fast, key=lambda each: each.nbytes) if fast else min(good, key=lambda each: each.seconds)
+        fast = [candidate for candidate in good if candidate.seconds <= count / total / rate]
+        chosen = min(fast, key=operator.attrgetter("nbytes")) if fast else min(good, key=operator.attrgetter("seconds"))
         plans.append(GroupPlan(names, count, sample.mesh_error, chosen, considered))
     reflected = reflection.fractions(shadings, environments, opacity=mesh.opacity, point_lights=scene.point_lights)
     bounces = reflection.needed(reflected, asked)
     return Plan(tuple(scene.names), tuple(plans), reflected, bounces, float(asked), float(rate), size, key)
 
 
-def _unmet(names: Sequence[str], best: Candidate, error: float | None) -> None:
+def _report_miss(names: Sequence[str], best: Candidate, error: float | None) -> None:
     """Refuses a group for which no system meets a given error; warns if none was given."""
     least = best.error * MARGIN
     name = f"part {names[0]!r}" if len(names) == 1 else f"parts {', '.join(map(repr, names))}"
@@ -214,13 +215,13 @@ def key_of(scene: Scene, environments: Sequence[Environment]) -> str:
     A function is identified by its qualified name only, which is the same in another process.
     """
     leaves, structure = jax.tree.flatten((scene, tuple(environments)))
-    arrays = [each for each in leaves if not callable(each)]
-    functions = [getattr(each, "__qualname__", type(each).__qualname__) for each in leaves if callable(each)]
+    arrays = [leaf for leaf in leaves if not callable(leaf)]
+    functions = [getattr(leaf, "__qualname__", type(leaf).__qualname__) for leaf in leaves if callable(leaf)]
     kinds = re.sub(r" at 0x[0-9a-f]+", "", f"{structure} {functions}")  # without the addresses of static functions
     return blocks.fingerprint(np.frombuffer(kinds.encode(), np.uint8), *arrays)
 
 
-def _considered(sample: Sample, alone: Sample | None, run: Run, error: float, seconds: float):
+def _candidates(sample: Sample, alone: Sample | None, run: Run, error: float, seconds: float):
     """Measures candidates of each system: a bisection along its steps, to the first that meets the error.
 
     `alone` is the sample with a BRDF that can be factored; None for groups without such a BRDF.
@@ -233,21 +234,21 @@ def _considered(sample: Sample, alone: Sample | None, run: Run, error: float, se
     most = math.inf  # largest number of bytes that is worth measuring
     for ladder in filter(None, ladders):
         least = [sample.least_bytes(recipe) for recipe, _ in ladder]
-        low, high = 0, sum(each <= most for each in least)
+        low, high = 0, sum(count <= most for count in least)
         while low < high:  # Assumption: from one step to the next, the error decreases by at most half.
             middle = (low + high) // 2
-            recipe, measured = ladder[middle]
-            each = _measured(measured, recipe, run)
-            yield each
-            if each.error * MARGIN > error:
-                halvings = math.log2(min(each.error, 1e6) * MARGIN / error)
+            recipe, taker = ladder[middle]
+            candidate = _measure(taker, recipe, run)
+            yield candidate
+            if candidate.error * MARGIN > error:
+                halvings = math.log2(min(candidate.error, 1e6) * MARGIN / error)
                 low = middle + max(1, int(halvings))
                 if most == math.inf:  # No candidate meets the error yet: measure the last step too, for the message.
                     low = min(low, max(middle + 1, len(ladder) - 1))
                 continue
-            high, fast = middle, each.seconds <= seconds
-            most = min(most, each.nbytes if fast else _SLOW * each.nbytes)
-            if fast and least[0] > (1 - _SAVING) * each.nbytes:
+            high, fast = middle, candidate.seconds <= seconds
+            most = min(most, candidate.nbytes if fast else _SLOW * candidate.nbytes)
+            if fast and least[0] > (1 - _SAVING) * candidate.nbytes:
                 break
 
 
@@ -259,14 +260,14 @@ def _ladder(recipe: Recipe, sample: Sample, alone: Sample | None) -> list[tuple[
     return [] if alone is None else [(step, alone) for step in steps]
 
 
-def _measured(sample: Sample, recipe: Recipe, run: Run) -> Candidate:
+def _measure(sample: Sample, recipe: Recipe, run: Run) -> Candidate:
     """Measures a candidate, or loads its measurement from a folder."""
     if run.path is None:
         return sample.measure(recipe)
     path = pathlib.Path(run.path, re.sub(r"\W+", "_", str(recipe)))
     if not path.exists():
         objects.save(path, sample.measure(recipe))
-    found = objects.load(path)
-    if not isinstance(found, Candidate):
-        raise ValueError(f"{path} is damaged: it must hold a candidate, got a {type(found).__name__}; delete it")
-    return found
+    candidate = objects.load(path)
+    if not isinstance(candidate, Candidate):
+        raise ValueError(f"{path} is damaged: it must hold a candidate, got a {type(candidate).__name__}; delete it")
+    return candidate

@@ -48,10 +48,10 @@ class Known:
 
     def factored(self, brdf: Callable, terms: int, resolution: int) -> SeparableBrdf:
         """The BRDF of the part, factored into terms. An earlier factorization is truncated if it has enough terms."""
-        made = self._factored.get(resolution)
-        if made is None or made.terms < terms:
-            made = self._factored[resolution] = separable.factor(brdf, terms=terms, resolution=resolution)
-        return made.truncate(terms)
+        brdf_terms = self._factored.get(resolution)
+        if brdf_terms is None or brdf_terms.terms < terms:
+            brdf_terms = self._factored[resolution] = separable.factor(brdf, terms=terms, resolution=resolution)
+        return brdf_terms.truncate(terms)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -419,7 +419,7 @@ def lobe_table(shading: Shading, lobes: int) -> lobe.LobeBrdf:
     """The BRDF of a part as a table of lobes, over roughness if that varies."""
     if shading.table is not None:
         counts = shading.table.counts
-        return shading.table.lobes(lobes if lobes in counts else min(counts, key=lambda each: abs(each - lobes)))
+        return shading.table.lobes(lobes if lobes in counts else min(counts, key=lambda count: abs(count - lobes)))
     return lobe.tabulate(shading.brdf, lobes=lobes, knot=shading.knot)
 
 

@@ -285,9 +285,8 @@ class VertexSystem(System):
             ValueError: The points do not lie on triangles of the mesh.
         """
         require.kind("the points", points, Points, source="jaxprt.scene.points.on_triangles")
-        every = eqx.tree_at(lambda each: each.points, self, None, is_leaf=lambda each: each is None)
-        points.check(every.vertices)
-        return eqx.tree_at(lambda each: each.points, self, points, is_leaf=lambda each: each is None)
+        points.check(_place(self, None).vertices)
+        return _place(self, points)
 
     def carried(self, attribute: Float[Array, "..."], *, axis: int = 0) -> Float[Array, "..."]:
         """Interpolates an attribute of the vertices to the points; returns it as it is without points."""
@@ -296,6 +295,10 @@ class VertexSystem(System):
     def place(self, transport: Any) -> tuple[Float[Array, "v 3"], Float[Array, "v 3 3"]]:
         """Positions and frames of the points, or those of the vertices, which `transport` holds."""
         return placed(transport.position, transport.frame, self.points)
+
+
+def _place(system: VertexSystem, points: Points | None) -> VertexSystem:
+    return eqx.tree_at(lambda system: system.points, system, points, is_leaf=lambda leaf: leaf is None)
 
 
 def _parameters(value: Any) -> Any:
@@ -326,9 +329,9 @@ class Blend(eqx.Module):
             raise TypeError(
                 f"the parameters of the blend must be a list of arrays, got {type(self.parameter).__name__}"
             )
-        for each in self.parameter:
-            require.finite("the parameters of the blend", each)
-            require.length("values of each parameter of the blend", each, len(self.weight))
+        for value in self.parameter:
+            require.finite("the parameters of the blend", value)
+            require.length("values of each parameter of the blend", value, len(self.weight))
 
     def check(self, vertices: int, channels: int) -> None:
         """Refuses a blend with another number of vertices or channels.
@@ -401,28 +404,28 @@ class Total(System):
 
     def light(self, environment: Environment) -> tuple[PyTree, ...]:
         """The light of each system."""
-        return tuple(each.light(environment) for each in self.part)
+        return tuple(system.light(environment) for system in self.part)
 
     def shade(self, light: tuple[PyTree, ...], materials: PyTree = None) -> tuple[PyTree, ...]:
         """Light that arrives at the vertices of each system."""
         require.kind("the light", light, tuple, source="Total.light")
-        return tuple(each.shade(lit, materials) for each, lit in zip(self.part, light, strict=True))
+        return tuple(system.shade(lit, materials) for system, lit in zip(self.part, light, strict=True))
 
     def view(self, eye: Float[Array, "3"], materials: PyTree = None) -> tuple[PyTree, ...]:
         """The view of each system."""
-        return tuple(each.view(eye, materials) for each in self.part)
+        return tuple(system.view(eye, materials) for system in self.part)
 
     @promoted
     def combine(self, light: tuple[PyTree, ...], view: tuple[PyTree, ...]) -> Float[Array, "v c"]:
         """The sum of the radiance of all systems."""
         require.kind("the light", light, tuple, source="Total.light")
         require.kind("the view", view, tuple, source="Total.view")
-        parts = (each.combine(*sides) for each, *sides in zip(self.part, light, view, strict=True))
+        parts = (system.combine(*sides) for system, *sides in zip(self.part, light, view, strict=True))
         return sum(parts, start=jnp.zeros((), jnp.result_type(float)))
 
     def at(self, points: Any) -> "Total":
         """The sum at points: `System.at`."""
-        return Total(tuple(each.at(points) for each in self.part))
+        return Total(tuple(system.at(points) for system in self.part))
 
     @property
     def vertices(self) -> int:
@@ -448,9 +451,9 @@ def check_points(points: Any, vertices: Sequence[int]) -> tuple[Points, ...]:
         ValueError: Points do not lie on triangles of their part.
     """
     check_list(points, len(vertices))
-    for each, count in zip(points, vertices, strict=True):
-        require.kind("the points", each, Points, source="jaxprt.scene.points.on_triangles")
-        each.check(count)
+    for of_part, count in zip(points, vertices, strict=True):
+        require.kind("the points", of_part, Points, source="jaxprt.scene.points.on_triangles")
+        of_part.check(count)
     return tuple(points)
 
 
@@ -493,8 +496,8 @@ def total(*systems: System) -> Total:
         TypeError: An argument is not a system.
         ValueError: There are no systems, or they have different numbers of vertices.
     """
-    for each in systems:
-        _check(each)
+    for system in systems:
+        _check(system)
     return Total(systems)
 
 
@@ -532,15 +535,15 @@ def radiance(
         return system.combine(system.shade(system.light(environment), materials), view)
     if not math.prod(batch):
         raise ValueError(f"a batch of lights must hold at least one, got {list(environment.radiance.shape)}")
-    lights = [Environment(each) for each in environment.radiance.reshape(-1, faces, rows, columns, colors)]
-    color = [system.combine(system.shade(system.light(each), materials), view) for each in lights]
+    lights = [Environment(light) for light in environment.radiance.reshape(-1, faces, rows, columns, colors)]
+    color = [system.combine(system.shade(system.light(light), materials), view) for light in lights]
     return jnp.stack(color).reshape(*batch, *color[0].shape)
 
 
 def memory(system: System) -> int:
     """Bytes of all arrays of a system: its transport and its BRDF. Shared arrays count once."""
     _check(system)
-    return sum(each.nbytes for each in {id(x): x for x in jax.tree.leaves(system) if hasattr(x, "nbytes")}.values())
+    return sum(array.nbytes for array in {id(x): x for x in jax.tree.leaves(system) if hasattr(x, "nbytes")}.values())
 
 
 def _check(system: Any) -> None:

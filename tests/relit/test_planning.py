@@ -166,7 +166,7 @@ def test_a_folder_keeps_the_plan_and_refuses_another(scene, sky, tmp_path, monke
     part, eye = prt.Scene([ground]), np.add(VIEWS[0], far)
     options = {"environments": [sky], "path": tmp_path / "kept", "progress": False}
     first = prt.precompute(part, refine=False, error=ASKED, **options)
-    monkeypatch.setattr(planning, "_considered", None)  # Nothing is measured again.
+    monkeypatch.setattr(planning, "_candidates", None)  # Nothing is measured again.
     again = prt.precompute(part, refine=False, error=ASKED, **options)
     np.testing.assert_array_equal(first.radiance(sky, eye=eye), again.radiance(sky, eye=eye))
     with pytest.raises(ValueError, match=r"was made for an error of 0\.3 .*, got 0\.2 .*: name another path"):
