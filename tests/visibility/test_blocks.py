@@ -522,6 +522,7 @@ def test_headers_of_all_traced_systems_name_versions_and_no_computed_float(spher
         "lamps": 0,
         "response": (np.ones((156, 6, 2), np.float32),),
         "components": 1,
+        "modes": 1,
     }
     kinds = [
         (separable.sparse._Job, {"brdf": brdf, "keep": 3}),
@@ -532,7 +533,7 @@ def test_headers_of_all_traced_systems_name_versions_and_no_computed_float(spher
         (interreflection._BounceJob, {"brdf": (), "rows": rows}),
         (interreflection._DiffuseBounceJob, {"rows": rows[:, 0], "albedo": np.ones((1, 1), int)}),
         (bounces.jobs.ResponseJob, {"basis": brdf, "edge": 1}),
-        (bounces.jobs.TransferJob, more | {"modes": 1}),
+        (bounces.jobs.TransferJob, more),
         (bounces.jobs.AgainJob, more | {"function": np.arange(1)}),
     ]
     before = [kind.make(mesh, None, None, 8, **fields) for kind, fields in kinds]
