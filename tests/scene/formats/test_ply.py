@@ -1,5 +1,6 @@
 """PLY files as other programs write them."""
 
+import itertools
 import os
 import struct
 import time
@@ -54,14 +55,18 @@ def colors(path):
 
 
 @pytest.mark.parametrize("form", FORMATS)
-@pytest.mark.parametrize("length", ["char", "uint8", "int16", "ushort", "int", "uint32"])
-@pytest.mark.parametrize("index", ["uchar", "int8", "short", "uint16", "int32", "uint"])
-def test_lists_of_all_types_and_of_different_lengths_are_read(tmp_path, form, length, index):
-    faces = [([0, 1, 2],), ([0, 1, 2, 3],), ([2, 3, 0],)]
-    elements = [("vertex", XYZ, SQUARE.tolist()), ("face", f"property list {length} {index} vertex_index\n", faces)]
-    geometry = mesh_file.read(write(tmp_path, elements, form), groups=False)
-    np.testing.assert_array_equal(geometry.position, SQUARE)
-    np.testing.assert_array_equal(geometry.face, [[0, 1, 2], [0, 1, 2], [0, 2, 3], [2, 3, 0]])
+def test_lists_of_all_types_and_of_different_lengths_are_read(tmp_path, form):
+    lengths = ["char", "uint8", "int16", "ushort", "int", "uint32"]
+    for length, index in itertools.product(lengths, ["uchar", "int8", "short", "uint16", "int32", "uint"]):
+        faces = (
+            "face",
+            f"property list {length} {index} vertex_index\n",
+            [([0, 1, 2],), ([0, 1, 2, 3],), ([2, 3, 0],)],
+        )
+        path = write(tmp_path, [("vertex", XYZ, SQUARE.tolist()), faces], form)
+        geometry = mesh_file.read(path, groups=False)
+        np.testing.assert_array_equal(geometry.position, SQUARE)
+        np.testing.assert_array_equal(geometry.face, [[0, 1, 2], [0, 1, 2], [0, 2, 3], [2, 3, 0]], f"{length} {index}")
 
 
 @pytest.mark.parametrize("form", FORMATS)
@@ -163,11 +168,14 @@ def test_strips_that_turn_at_triangles_without_area_keep_their_orientation(tmp_p
     np.testing.assert_array_equal(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), [[0, 0, 1]] * 2)
 
 
-@pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize(
-    ("kind", "most", "half"), [("uchar", 255, 128 / 255), ("ushort", 65535, 32768 / 65535), ("float", 1, 0.5)]
+    ("form", "kind", "most", "half", "names"),
+    [
+        ("ascii", "uchar", 255, 128 / 255, ("red", "green", "blue")),
+        ("binary_little_endian", "ushort", 65535, 32768 / 65535, ("diffuse_red", "diffuse_green", "diffuse_blue")),
+        ("binary_big_endian", "float", 1, 0.5, "rgb"),
+    ],
 )
-@pytest.mark.parametrize("names", [("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), "rgb"])
 def test_vertex_colors_are_the_base_color_decoded_from_srgb(tmp_path, form, kind, most, half, names):
     middle = 0.5 if kind == "float" else (most + 1) // 2
     color = [(most, 0, 0), (0, most, 0), (0, 0, most), (middle, middle, middle)]
