@@ -75,9 +75,8 @@ def test_orders_are_as_named():
         np.testing.assert_array_equal(Convention(order=order).write(number)[4:], band[order])
 
 
+@pytest.mark.parametrize(("order", "axes"), list(zip(ORDERS, ["+x+y+z", "-z+x-y", "+x+y-z"], strict=True)))
 @pytest.mark.parametrize("condon_shortley", [False, True])
-@pytest.mark.parametrize("order", ORDERS)
-@pytest.mark.parametrize("axes", ["+x+y+z", "-z+x-y", "+x+y-z"])
 def test_what_is_written_and_read_is_the_same_and_dot_products_stay(condon_shortley, order, axes, close):
     convention = Convention(condon_shortley=condon_shortley, order=order, axes=axes)
     value, other = RNG.normal(size=(2, 36, 3))
