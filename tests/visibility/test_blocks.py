@@ -523,6 +523,7 @@ def test_headers_of_all_traced_systems_name_versions_and_no_computed_float(spher
         "response": (np.ones((156, 6, 2), np.float32),),
         "components": 1,
         "modes": 1,
+        "function": np.arange(1),
     }
     kinds = [
         (separable.sparse._Job, {"brdf": brdf, "keep": 3}),
@@ -534,7 +535,7 @@ def test_headers_of_all_traced_systems_name_versions_and_no_computed_float(spher
         (interreflection._DiffuseBounceJob, {"rows": rows[:, 0], "albedo": np.ones((1, 1), int)}),
         (bounces.jobs.ResponseJob, {"basis": brdf, "edge": 1}),
         (bounces.jobs.TransferJob, more),
-        (bounces.jobs.AgainJob, more | {"function": np.arange(1)}),
+        (bounces.jobs.AgainJob, more),
     ]
     before = [kind.make(mesh, None, None, 8, **fields) for kind, fields in kinds]
     starts = visibility.start_points

@@ -91,6 +91,7 @@ def precompute(
     factor = tuple(brdf.factor if isinstance(brdf, BrdfSet) else functions.fixed_weights(brdf) for brdf in brdfs)
     white = np.concatenate([_white(*pair) for pair in zip(factor, weights, strict=True)])
     parts = {"lamps": 0 if lamps is None else lamps.lamps, "white": white, "scale": np.asarray(scales(factor))}
+    parts["function"] = np.arange(len(white))
     sizes = {"components": components, "modes": min(modes, 6 * edge * edge), "size": size}
     job = _job(mesh, brdfs, np.searchsorted(numbers, mesh.region), edge, lamps, run, parts, sizes)
     found, member = visibility.blocks.compute(job, run.within("clusters"), label="bounce"), job.member
@@ -303,10 +304,7 @@ def _second(
     """The second bounce, or None if a sample of clusters shows too little worth; and its irradiance at vertices."""
     if least > 0:
         sample = np.linspace(0, len(member) - 1, min(_SAMPLE, len(member))).astype(int)
-        texels = job.response[0].shape[2] // len(job.function) - job.lamps
-        brought = np.concatenate(
-            [job.brought(job.tensor(member[each])[:, :texels], member[each], white) for each in sample]
-        )
+        brought = np.concatenate([job.bring(member[cluster]) for cluster in sample])
         if _rms(brought) < least:
             return None, brought
     found = visibility.blocks.compute(job, run.within("clusters_2"), label="bounce 2")

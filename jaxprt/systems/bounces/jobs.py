@@ -73,6 +73,7 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
         lamps: Number of lamps.
         white: Weights of all functions with which the worth of a bounce is estimated.
         scale: Weights of all functions in the errors of decompositions.
+        function: Indices of the functions that are computed.
         region: Index of each vertex's region.
         member: Vertices of each cluster.
         components: Number of principal components over the vertices of a cluster.
@@ -85,6 +86,7 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
     lamps: int
     white: np.ndarray
     scale: np.ndarray
+    function: np.ndarray
     region: np.ndarray
     member: np.ndarray
     components: int
@@ -93,37 +95,44 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
 
     @property
     def spectrum(self) -> tuple[np.ndarray, np.ndarray]:
-        """Matrix from the columns of the light to ones that matter alike, and its inverse."""
+        """Matrix from the columns of the environment's light to ones that matter alike, and its inverse."""
+        raise NotImplementedError
+
+    @property
+    def uniform(self) -> np.ndarray:
+        """Columns of the environment's light under which the worth of a bounce is estimated."""
         raise NotImplementedError
 
     @functools.cached_property
-    def reduced(self) -> tuple[tuple[np.ndarray, ...], np.ndarray | None]:
-        """Responses to fewer modes of the light, and the matrix from these modes to the light, None without need.
+    def reduced(self) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+        """Responses to orthonormal modes of the light, and these modes in columns that matter alike; then lamps.
 
-        The modes are principal components of the responses, fewer than the texels of the light, and gathering takes as
-        much less time. Lamps are modes of their own.
+        The modes are principal components of the responses. They are fewer than the columns, and gathering takes as
+        much less time.
         """
-        forward, inverse = self.spectrum
-        texels, count = len(forward), self.modes * 3 // 2
-        if count >= texels:
-            return self.response, None
-        square = np.zeros((texels, texels))
+        forward, _ = self.spectrum
+        columns, count = len(forward), self.modes * 3 // 2
+        mode = np.eye(columns)
+        if count < columns:
+            mode = np.linalg.eigh(self._products(forward.T.astype(np.float32)))[1][:, : -count - 1 : -1]
+        lamps = np.eye(self.response[0].shape[2] - columns)
+        onto = scipy.linalg.block_diag(forward.T @ mode, lamps).astype(np.float32)
+        rows = [(response.reshape(-1, len(onto)) @ onto).reshape(*response.shape[:2], -1) for response in self.response]
+        return tuple(rows), mode.astype(np.float32)
+
+    def _products(self, forward: np.ndarray) -> np.ndarray:
+        """Products of columns of the light, over the responses of some vertices."""
+        result = np.zeros((len(forward), len(forward)))
         for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
-            strength = np.sqrt(np.mean(np.square(np.asarray(basis.view_map, np.float64)), (1, 2, 3)))
+            strength = np.sqrt(np.mean(np.square(np.asarray(basis.view_map)), (1, 2, 3)))
             vertices = len(self.vertices_of(number))
             sample = np.unique(np.linspace(0, vertices - 1, min(_SAMPLE, vertices)).astype(int))
-            rows = response[sample, :, :texels] @ forward.T.astype(np.float32) * strength[:, None].astype(np.float32)
-            size = np.sum(rows**2, (1, 2), dtype=np.float64)
+            rows = response[sample, :, : len(forward)] @ forward * strength[:, None]
+            size = np.sum(rows**2, (1, 2))
             size = np.sqrt(size + _DIM**2 * max(np.mean(size), np.finfo(np.float32).tiny))
-            flat = (rows / size[:, None, None].astype(np.float32)).reshape(-1, texels)
-            square += flat.T @ flat
-        mode = np.linalg.eigh(square)[1][:, : -count - 1 : -1]
-        lamps = np.eye(self.response[0].shape[2] - texels)
-        onto, back = (
-            scipy.linalg.block_diag(matrix, lamps).astype(np.float32)
-            for matrix in (forward.T @ mode, mode.T @ inverse.T)
-        )
-        return tuple((row.reshape(-1, len(onto)) @ onto).reshape(*row.shape[:2], -1) for row in self.response), back
+            flat = (rows / size[:, None, None]).reshape(-1, len(forward))
+            result += flat.T @ flat
+        return result
 
     @property
     def header(self) -> Mapping[str, Any]:
@@ -156,15 +165,15 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
         return np.flatnonzero(self.basis[self.region] == basis)
 
     def arrived(self, part: np.ndarray) -> Float[np.ndarray, "b s q l"]:
-        """Harmonics of the light that arrives at some vertices, before compression."""
+        """Harmonics of the light that arrives at some vertices, for each mode of the light and then for each lamp."""
         hits = gather.rays(self.rays, self.start[part], self.frame[part, 2], self.frame, self.region, size=self.size)
         way = np.asarray(cubemap.direction(size=self.size), np.float32).reshape(-1, 3)
         share, cosine = gather.shares(self.frame[part, 2], size=self.size), gather.cosines(self.frame[part, 2])
-        result, surfaces, (reduced, back) = [], {}, self.reduced
+        result, surfaces, reduced = [], {}, self.reduced[0]
         for number, kind in enumerate(self.basis.tolist()):
             basis, response = self.bases[kind], reduced[kind]
             if number not in hits:
-                shape = (len(part), cosine.shape[-1], basis.view_map.shape[-1], self.response[kind].shape[2])
+                shape = (len(part), cosine.shape[-1], basis.view_map.shape[-1], response.shape[2])
                 result.append(np.zeros(shape, np.float32))
                 continue
             rays = hits[number]
@@ -186,8 +195,7 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
                 block = slice(first, first + _GROUPS)
                 fixed = (owner, local[corner], weight, way[texel], measure)
                 arrived = gather.arrive(arrived, *surface, *jax.device_put(tuple(rows[block] for rows in fixed)))
-            rows = np.asarray(arrived)[: len(part)]
-            result.append(rows if back is None else (rows.reshape(-1, len(back)) @ back).reshape(*rows.shape[:3], -1))
+            result.append(np.asarray(arrived)[: len(part)])
         return np.concatenate(result, 2)
 
     def lamp_layout(self, *functions: int) -> Mapping[str, Layout]:
@@ -203,15 +211,23 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
         """Components of light from lamps: weights of the vertices of a cluster, and the core. Nothing without lamps."""
         if not self.lamps:
             return {}
-        weight, core, _ = _along_vertices(tensor * scale, components=self.components)
-        return {"lamp_weight": weight, "lamp": (core / scale)[None]}
+        vertex, core, _ = _along_vertices(tensor * scale, components=self.components)
+        weight, core = _scaled(vertex, core)
+        return {"lamp_weight": weight, "lamp": (core.swapaxes(0, 1) / scale).astype(np.float16)[None]}
 
-    def brought(self, tensor: Float[np.ndarray, "b l s *q"], part: np.ndarray, white: np.ndarray) -> np.ndarray:
-        """Irradiance over pi at each vertex of a part, for given weights of functions, under uniform light."""
-        light = np.sum(tensor, 1)
-        for _ in range(light.ndim - 2):
-            light = light @ white
-        return np.sum(light * gather.cosines(self.frame[part, 2]), 1)
+    def irradiance(self, light: Float[np.ndarray, "b m s q"], part: np.ndarray) -> Float[np.ndarray, " b"]:
+        """Irradiance over pi at each vertex of a part, for white surfaces under uniform light."""
+        uniform = self.reduced[1].T @ (self.spectrum[1].T @ self.uniform).astype(np.float32)
+        arriving = np.tensordot(light, uniform, (1, 0)) @ self.white[self.function]
+        return np.sum(arriving * gather.cosines(self.frame[part, 2]), 1)
+
+    def bring(self, part: np.ndarray) -> Float[np.ndarray, " b"]:
+        """Irradiance over pi that a bounce brings to some vertices, for white surfaces under uniform light."""
+        return self.irradiance(self.tensors(part)[0], part)
+
+    def tensors(self, part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The light that arrives at some vertices before compression: for modes of the light, and for lamps."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -222,6 +238,11 @@ class TransferJob(_PathJob):
     def spectrum(self) -> tuple[np.ndarray, np.ndarray]:
         """Matrix from texels to wavelets under a natural power spectrum, and its inverse."""
         return _spectrum(self.response[0].shape[2] - self.lamps)
+
+    @property
+    def uniform(self) -> np.ndarray:
+        """Light of radiance 1."""
+        return np.ones(self.response[0].shape[2] - self.lamps)
 
     @property
     def layout(self) -> Mapping[str, Layout]:
@@ -239,21 +260,20 @@ class TransferJob(_PathJob):
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         """One block."""
-        whole = self.tensor(self.member[block])
-        tensor, lamp = np.split(whole, [whole.shape[1] - self.lamps], 1)
-        count, light, harmonic, functions = tensor.shape
-        flat = (tensor * self.scale).reshape(count, light, -1)
-        weight, core, mode, error = compress(flat, components=self.components, modes=self.modes)
-        core = core.reshape(1, *core.shape[:2], harmonic, functions) / self.scale
-        white = self.brought(tensor, self.member[block], self.white)
-        energy = np.sum(whole**2, (0, 1, 2))[None]
-        rows = {"weight": weight, "core": core, "mode": mode[None], "error": np.array([error]), "energy": energy}
-        rows |= {"white": white, **self.lamp_rows(lamp, self.scale)}
+        light, lamp = self.tensors(self.member[block])
+        weight, core, mode, error = compress(light * self.scale, components=self.components, modes=self.modes)
+        mode = self.spectrum[1] @ self.reduced[1] @ mode
+        energy = np.sum(light**2, (0, 1, 2)) + np.sum(lamp**2, (0, 1, 2))
+        rows = {"weight": weight, "core": (core / self.scale)[None], "mode": mode[None], "energy": energy[None]}
+        rows |= {"error": np.array([error]), "white": self.irradiance(light, self.member[block])}
+        rows |= self.lamp_rows(lamp, self.scale)
         return {name: np.asarray(row) for name, row in rows.items()}, 0
 
-    def tensor(self, part: np.ndarray) -> Float[np.ndarray, "b l s q"]:
-        """The light that arrives at some vertices, before compression."""
-        return np.moveaxis(self.arrived(part), 3, 1)
+    def tensors(self, part: np.ndarray) -> tuple[Float[np.ndarray, "b m s q"], Float[np.ndarray, "b i s q"]]:
+        """The light that arrives at some vertices before compression: for modes of the light, and for lamps."""
+        tensor = np.moveaxis(self.arrived(part), 3, 1)
+        light, lamp = np.split(tensor, [tensor.shape[1] - self.lamps], 1)
+        return light, lamp
 
     def without_response(self) -> "TransferJob":
         """The job without responses: about 40 kB for each vertex that are not needed when its blocks are done."""
@@ -302,31 +322,31 @@ class TransferJob(_PathJob):
                     responses = gather.respond_again(arriving, jnp.asarray(self.frame[member]), basis)
                     response[number][local[member[here]]] = np.asarray(responses)[here].swapaxes(1, 2)
         same = {field.name: getattr(self, field.name) for field in fields(_PathJob)}
-        changed = {
-            "response": tuple(response),
-            "components": components,
-            "size": max(self.size // 2, min(self.size, _COARSE)),
-        }
-        return AgainJob(**{**same, **changed}, function=function)
+        changed = {"response": tuple(response), "components": components, "function": function}
+        return AgainJob(**{**same, **changed, "size": max(self.size // 2, min(self.size, _COARSE))})
 
 
 @dataclass(frozen=True)
 class AgainJob(_PathJob):
-    """Tensors of two bounces.
+    """Tensors of two bounces."""
 
-    Attributes:
-        function: Indices of the functions that are kept.
-    """
-
-    function: np.ndarray
     system: ClassVar[str] = "transfer 2"
+
+    @property
+    def texels(self) -> int:
+        """Number of texels of the light."""
+        return self.response[0].shape[2] // len(self.function) - self.lamps
 
     @property
     def spectrum(self) -> tuple[np.ndarray, np.ndarray]:
         """Scales of the functions that send the light of each texel, as a matrix, and its inverse."""
-        functions = len(self.function)
-        scale = np.tile(self.scale[self.function], self.response[0].shape[2] // functions - self.lamps)
+        scale = np.tile(self.scale[self.function], self.texels)
         return np.diag(scale), np.diag(1 / scale)
+
+    @property
+    def uniform(self) -> np.ndarray:
+        """Light of radiance 1 by white functions."""
+        return np.tile(self.white[self.function], self.texels)
 
     @property
     def header(self) -> Mapping[str, Any]:
@@ -337,8 +357,7 @@ class AgainJob(_PathJob):
     def layout(self) -> Mapping[str, Layout]:
         """Shapes of one block."""
         functions = len(self.function)
-        light = self.response[0].shape[2] // functions - self.lamps
-        shape = (1, light, self.components, (DEGREE + 1) ** 2, functions, functions)
+        shape = (1, self.texels, self.components, (DEGREE + 1) ** 2, functions, functions)
         return {
             "weight": Layout((self.step, self.components), 0, "float32"),
             "core": Layout(shape, 0, "float16"),
@@ -349,59 +368,60 @@ class AgainJob(_PathJob):
 
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         """One block."""
-        tensor = self.tensor(self.member[block])
-        tensor, lamp = np.split(tensor, [tensor.shape[1] - self.lamps], 1)
+        light, lamp = self.tensors(self.member[block])
         scale = self.scale[self.function]
+        vertex, core, error = _along_vertices(light * scale, components=self.components)
+        core = np.tensordot(core, self.reduced[1], (1, 1))  # [components, harmonic, second function, column]
+        core = np.moveaxis(core.reshape(*core.shape[:3], self.texels, -1), 2, -1)
+        weight, core = _scaled(vertex, np.moveaxis(core, 2, 1))
         both = scale[:, None] * scale
-        weight, core, error = _along_vertices(tensor * both, components=self.components)
-        rows = {"weight": weight, "core": (core / both)[None], "error": np.array([error])}
-        white = self.brought(tensor, self.member[block], self.white[self.function])
-        rows |= {"white": white, **self.lamp_rows(lamp, both)}
+        rows = {"weight": weight, "core": (core.swapaxes(0, 1) / both).astype(np.float16)[None]}
+        rows |= {"error": np.array([error]), "white": self.irradiance(light, self.member[block])}
+        rows |= self.lamp_rows(lamp, both)
         return {name: np.asarray(row) for name, row in rows.items()}, 0
 
-    def tensor(self, part: np.ndarray) -> Float[np.ndarray, "b l s q q"]:
-        """The light that arrives at some vertices, before compression."""
-        arrived = self.arrived(part)[:, :, self.function]
-        arrived = arrived.reshape(*arrived.shape[:3], -1, len(self.function))
-        return arrived.transpose(0, 3, 1, 4, 2)
+    def tensors(self, part: np.ndarray) -> tuple[Float[np.ndarray, "b m s q"], Float[np.ndarray, "b i s q q"]]:
+        """The light that arrives at some vertices before compression: for modes of the light, and for lamps."""
+        tensor = np.moveaxis(self.arrived(part)[:, :, self.function], 3, 1)
+        light, lamp = np.split(tensor, [self.reduced[1].shape[1]], 1)
+        lamp = lamp.reshape(len(lamp), self.lamps, len(self.function), *lamp.shape[2:])
+        return light, lamp.transpose(0, 1, 3, 2, 4)
 
 
 def compress(
-    tensor: Float[np.ndarray, "m l f"], *, components: int, modes: int
-) -> tuple[Float[np.ndarray, "m n"], Float16[np.ndarray, "e n f"], Float[np.ndarray, "l e"], float]:
+    tensor: Float[np.ndarray, "m l *f"], *, components: int, modes: int
+) -> tuple[Float[np.ndarray, "m n"], Float16[np.ndarray, "e n *f"], Float[np.ndarray, "l e"], float]:
     """Decomposes the tensor of a cluster along the vertices, and then along the light.
 
-    It minimizes the squared error under light with the natural power spectrum. Eigenvectors are LAPACK's, on the host:
-    the matrices are small, and no program is compiled.
+    Eigenvectors are LAPACK's, on the host: the matrices are small, and no program is compiled.
 
     Args:
-        tensor: Light that arrives at each vertex from each texel, for all harmonics and functions f.
+        tensor: Light that arrives at each vertex for each of some orthonormal modes of the light, for all harmonics and
+            functions f.
         components: Number of principal components over the vertices.
         modes: Number of principal components over the light.
 
     Returns:
-        Weights of each vertex, cores scaled to a largest entry of 1, modes, and the relative error.
+        Weights of each vertex, cores scaled to a largest entry of 1, principal components of the light, and the
+        relative error.
     """
-    forward, inverse = _spectrum(tensor.shape[1])
-    wavelet = np.matmul(forward.astype(tensor.dtype), tensor)
-    whole = _square(wavelet)
-    vertex, core = _principal(wavelet, components, axis=0)
+    whole = _square(tensor)
+    vertex, core = _principal(tensor, components, axis=0)
     mode, core = _principal(core, modes, axis=1)
     left = max(whole - _square(core), 0)
     weight, core = _scaled(vertex, core)
     error = math.sqrt(left / whole) if whole > 0 else 0.0
-    return weight, core.astype(np.float16).swapaxes(0, 1), inverse @ mode, error
+    return weight, core.astype(np.float16).swapaxes(0, 1), mode, error
 
 
 def _along_vertices(
     tensor: Float[np.ndarray, "m l *f"], *, components: int
-) -> tuple[Float[np.ndarray, "m n"], Float16[np.ndarray, "l n *f"], float]:
-    """Decomposes a tensor along the vertices only, for light of few texels that all have the same weight."""
+) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "n l *f"], float]:
+    """Decomposes a tensor along the vertices only: orthonormal weights, cores, and the relative error."""
     whole = _square(tensor)
     vertex, core = _principal(tensor, components, axis=0)
     left = max(whole - _square(core), 0)
-    weight, core = _scaled(vertex, core)
-    return weight, core.astype(np.float16).swapaxes(0, 1), math.sqrt(left / whole) if whole > 0 else 0.0
+    return vertex, core, math.sqrt(left / whole) if whole > 0 else 0.0
 
 
 @functools.cache
