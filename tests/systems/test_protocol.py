@@ -257,6 +257,23 @@ def relit(system: prt.System, environment: Environment, materials: Any) -> jax.A
     return prt.radiance(system, environment, eye=EYE, materials=materials)
 
 
+# How far pages are off systems at full resolution: lobes have diffuse light of degree 6, dynamic parts lose the tensor.
+EXPORTED = {"harmonic": 1e-5, "harmonic, diffuse": 1e-5, "dynamic": 0.15}
+EXPORTED |= dict.fromkeys(["lobe", "lobe, matte", "lobe, bright texels"], 0.005)
+
+
+@each_system
+def test_a_page_shows_a_system_or_refuses_it_by_name(name, close):
+    case = case_of(name)
+    if name not in EXPORTED:
+        with pytest.raises(ValueError, match=r"the ball must be .* to be exported, got \w+, which has no method"):
+            case.system.exported("the ball")
+        return
+    shown = Case(case.system.exported("the ball").relit(), case.materials, case.mesh)
+    environment = light(lamps=0)
+    close(color_of(shown, environment), color_of(case, environment), tolerance=EXPORTED[name])
+
+
 @each_system
 def test_a_white_surface_in_a_white_furnace_is_white(name):
     if SYSTEMS[name].white is None:
