@@ -457,12 +457,12 @@ class SystemName(click.Choice):
     """Names of systems: some of jaxprt's, and those of other packages."""
 
     @property
-    def choices(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def choices(self) -> tuple[str, ...]:
         """All names."""
         return (*self._names, *(name for name in registry.systems() if name not in NAMES))
 
     @choices.setter
-    def choices(self, names: tuple[str, ...]) -> None:
+    def choices(self, names: tuple[str, ...]) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
         self._names = names
 
 
