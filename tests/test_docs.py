@@ -123,7 +123,7 @@ def small(coarse: None, bound) -> Iterator[None]:
         for module in (measuring, planning):
             patch.setattr(module, "views_around", lambda mesh: views(mesh)[1::3])
         for module in (measuring, sampling):
-            patch.setattr(module, "JUDGED", 200)
+            patch.setattr(module, "POINTS", 200)
             patch.setattr(module, "FEWEST", 40)
         yield
 

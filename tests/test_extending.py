@@ -138,7 +138,7 @@ def test_what_is_saved_is_loaded_without_an_import_by_the_reader(relit, light, t
 
 def test_plans_try_the_system_and_choose_it_where_its_error_suffices(scene, light, monkeypatch, tmp_path):
     for module in (measuring, sampling):
-        monkeypatch.setattr(module, "JUDGED", 200)
+        monkeypatch.setattr(module, "POINTS", 200)
         monkeypatch.setattr(module, "FEWEST", 40)
     ground = dataclasses.replace(scene, parts=scene.parts[1:])
     options = {"environments": [light], "rate": 1e-3, "refine": False, "path": tmp_path, "progress": False}
