@@ -75,7 +75,6 @@ def small(coarse, bound):
             (prt.separable.factor, {"resolution": 12}),
             (prt.harmonic.tabulate, {"error": 1e-2}),
             (prt.lobe.tabulate, {"resolution": 16}),
-            (prt.bounces.factor, {"resolution": 12}),
             (prt.bounces.precompute, {"edge": 2, "size": 8, "components": 8, "modes": 24}),
         ):
             bound(patch, function, **limits)

@@ -33,7 +33,7 @@ import jaxprt
 from benchmarks import published
 from benchmarks.published.lobes import Remainder
 from benchmarks.published.quantized import quantize
-from jaxprt import bounces, brdf, dynamic, scene, visibility
+from jaxprt import brdf, dynamic, scene, visibility
 from jaxprt import harmonic as harmonic_system
 from jaxprt import lobe as lobe_system
 from jaxprt import separable as separable_system
@@ -89,7 +89,6 @@ HOST = {
     "systems.separable.sparse.precompute": "traces rays",
     "benchmarks.published.factorization": "checks values",
     "benchmarks.published.lobes.mirror_lobes": "checks values",
-    "benchmarks.published.tensors.factor_tensor": "checks values",
     "benchmarks.published.transfer": "takes half precision; tests/figures/test_transfer.py",
     "benchmarks.published.tensors.hooi": "gives vectors of either sign",
     "systems.axes": "reads annotations",
@@ -172,16 +171,10 @@ HOST = {
     "systems.lobe.table.brdf_samples": "checks values",
     "systems.lobe.table.measured_error": "gives a Python number",
     "systems.lobe.table.is_isotropic": "compares values",
-    "systems.dynamic.brdf_set.separate": "checks values",
-    "systems.dynamic.brdf_set.factor": "the same",
-    "systems.dynamic.brdf_set.decompose": "the same",
-    "systems.dynamic.reflected.reflect": "the same",
-    "systems.dynamic.brdf_set.check": "the same",
+    "systems.dynamic.reflected.reflect": "checks values",
     "systems.dynamic.reflected.check_values": "the same",
-    "systems.dynamic.brdf_set.check_ranks": "the same",
     "systems.dynamic.reflected.stacked": "looks at types",
     "systems.bounces.functions.basis": "counts colors by values",
-    "systems.bounces.functions.factor": "checks values",
     "systems.bounces.functions.shared": "checks values, and turns singular vectors on the host",
     "systems.bounces.functions.fixed_weights": "counts colors by values",
     "systems.bounces.gather.rays": "traces rays",
@@ -197,9 +190,6 @@ HOST = {
     "brdf.places.triangulate": "by SciPy, where data enters",
     "brdf.places.in_columns": "compares values",
     "brdf.places.columns": "sorts on the host, where data enters",
-    "systems.bounces.between.pairs": "NumPy on the host",
-    "systems.bounces.between.middles": "looks at types",
-    "systems.bounces.between.quadratic": "takes indices; tested through bounces.factor",
     "brdf.navigation.blinn_phong": "checks values",
     "brdf.navigation.cook_torrance": "reads a file",
     "systems.dynamic.table.tabulate": "checks values",
@@ -207,23 +197,10 @@ HOST = {
     "systems.dynamic.transport.precompute": "traces rays",
     "systems.dynamic.transport.compress": "runs workers and writes files",
     "systems.dynamic.transport.clustering": "counts",
-    "systems.dynamic.set_transport.precompute_sets": "traces rays",
-    "systems.dynamic.set_transport.compress": "runs workers and writes files",
-    "systems.dynamic.set_relight.check_material": "checks values",
-    "systems.dynamic.set_relight.light_side": "gives indices; dynamic.radiance has them all",
-    "systems.dynamic.set_relight.view_side": "the same",
-    "systems.dynamic.set_relight.mix": "the same",
     "systems.devices": "puts arrays on devices",
     "systems.protocol": "calls the methods of systems; tests/systems/test_protocol.py holds these",
-    "systems.dynamic.set_relight.combine": "takes indices; the same",
-    "systems.bounces.relight.light_side": "takes half precision; bounces.radiance has them all",
-    "systems.bounces.relight.arriving": "takes indices; the same",
-    "systems.bounces.relight.view_side": "takes indices; the same",
+    "systems.bounces.relight.light_side": "takes half precision; tests/systems/test_protocol.py has scenes",
     "systems.bounces.relight.collect": "takes half precision; the same",
-    "systems.bounces.relight.weights": "takes half precision; the same",
-    "systems.bounces.relight.combine": "takes indices; the same",
-    "systems.bounces.relight.gathered": "takes half precision; the same",
-    "systems.bounces.relight.changes": "takes half precision; the same",
     "systems.lobe.em": "the steps of lobe.tabulate, and tested through it",
     "systems.separable.factorization.light_errors": "draws its own directions",
     "systems.separable.factorization.tabulate": "checks values",
@@ -373,21 +350,6 @@ class Draw:
         weight, diffuse = self.uniform(3, lobes, 5), self.uniform(3, 5)
         return lobe_system.LobeBrdf(mean, self.uniform(lobes, 5, low=1, high=3), weight, diffuse, (), self.uniform())
 
-    def changing(self, count=2):
-        """A set of BRDFs with lobes and terms."""
-        each = [self.lobes() for _ in range(count)]
-        stack = lambda name, axis: self.array(np.stack([getattr(one, name) for one in each], axis))  # noqa: E731
-        lobe = lobe_system.LobeBrdf(
-            stack("mean", 2),
-            stack("scale", 1),
-            stack("weight", 2),
-            stack("diffuse", 1),
-            (self.normal(count),),
-            self.uniform(),
-        )
-        maps = self.normal(2, 4, 4), self.normal(2, 4, 4)
-        return dynamic.BrdfSet(self.normal(2, 2, 2), self.normal(count, 1, 2), *maps, lobe, None, self.uniform())
-
     def tensor(self):
         """A BRDF with lobes and terms."""
         lobe, maps = self.lobes(), (self.normal(2, 4, 4), self.normal(3, 4, 4))
@@ -398,55 +360,6 @@ class Draw:
         """Transport of two lamps, the first of two pieces."""
         moment = self.uniform(3, vertices), self.uniform(3, vertices), self.normal(3, 3, vertices)
         return LampTransport(*moment, self.normal(vertices, 3), self.rotation(vertices), (0, 0, 1))
-
-    def regions(self, size=8, vertices=3):
-        """Transport of one region for ``changing`` and ``light``."""
-        seen = self.pyramid(size, vertices=vertices)
-        small = lobe_system.LobeTransport(seen.pyramid, seen.vector[:0], seen.position, seen.frame, size)
-        row = jax.device_put(np.arange(vertices, dtype=np.int32))
-        terms = separable_system.ClusteredTransport(
-            self.integer(6 * size * size, 1, 5, dtype=jnp.uint16),
-            jax.device_put(np.zeros((1, 5, 4), np.float16)),
-            jax.device_put(np.zeros((1, 4, 2, 3), np.float16)),
-            self.normal(1, vertices, 2),
-            seen.position,
-            seen.frame,
-            row,
-            row,
-            self.uniform(6 * size * size),
-        )
-        # Stored in half precision; here in the one under test.
-        both = self.normal(1, 5, 4), self.normal(1, 4, 2, 3)
-        terms = eqx.tree_at(lambda each: (each.mode, each.core), terms, both)
-        return dynamic.SetTransport((dynamic.RegionTransport(terms, small, row),), row)
-
-    def material(self, vertices=3):
-        """What ``regions`` is made of; the color of its lobes is a texture."""
-        weight = np.asarray(self.uniform(2))
-        return dynamic.Material(self.array(weight / weight.sum()), self.uniform(3), self.uniform(vertices, 3))
-
-    def transfer(self, vertices):
-        """Bounces of ``changing``, with what is stored in half precision in the one under test."""
-        row, zero = (
-            jax.device_put(each) for each in (np.arange(vertices, dtype=np.int32), np.zeros(vertices, np.int32))
-        )
-        core = jax.device_put(np.zeros((1, 6, 2, 16, 3, 3), np.float16))
-        second = bounces.SecondBounce(self.normal(1, vertices, 2), core, self.uniform(1))
-        tensor = bounces.TransferTensor(
-            self.normal(1, vertices, 2),
-            jax.device_put(np.zeros((1, 3, 2, 16, 3), np.float16)),
-            self.normal(1, 24, 3),
-            row,
-            zero,
-            self.uniform(vertices),
-            jax.device_put(np.arange(3, dtype=np.int32)),
-            (self.normal(2, 1, 2),),
-            second,
-            self.uniform(1),
-            self.uniform(2),
-        )
-        cores = self.normal(1, 3, 2, 16, 3), self.normal(1, 6, 2, 16, 3, 3)
-        return eqx.tree_at(lambda each: (each.core, each.second.core), tensor, cores)
 
     def mixture(self, lobes=2):
         """Wide lobes on the sphere."""
@@ -730,24 +643,8 @@ EXAMPLES = {
     "systems.harmonic.table.HarmonicBrdf": example(lambda draw: call(draw.harmonic(), draw.upper(5), draw.upper(5))),
     "systems.lobe.table.LobeBrdf": example(lambda draw: call(draw.lobes(), draw.upper(5), draw.upper(5))),
     "systems.bounces.traced.albedos": example(lambda draw: call(draw.lobes())),
-    "systems.lobe.table.mean": example(
-        lambda draw: call(draw.changing().lobe, draw.uniform(2)),
-        gradient=("table", "weight"),
-    ),
-    "systems.dynamic.brdf_set.Mixed": example(
-        lambda draw: call(draw.changing().at(draw.uniform(2)), draw.upper(5), draw.upper(5)),
-    ),
     "systems.dynamic.table.DynamicBrdf": example(lambda draw: call(draw.tensor(), draw.upper(5), draw.upper(5))),
     "systems.dynamic.transport.light_factors": example(lambda draw: call(draw.tensor())),
-    "systems.dynamic.set_transport.light_factors": example(lambda draw: call(draw.changing())),
-    "systems.bounces.functions.weights": example(
-        lambda draw: call(draw.normal(2, 1, 2), draw.uniform(2), draw.uniform(3), draw.uniform(1)),
-    ),
-    "systems.bounces.between.Moved": example(
-        lambda draw: call(bounces.between.Moved(draw.lobes()), draw.upper(5), draw.upper(5)),
-    ),
-    "systems.dynamic.brdf_set.combined": example(lambda draw: call(draw.normal(3, 3, 1, 2), draw.uniform(3))),
-    "systems.dynamic.brdf_set.between": example(lambda draw: call(draw.uniform(3), draw.uniform(3))),
     "systems.bounces.functions.albedo": example(lambda draw: call(draw.separable())),
     "systems.bounces.functions.project": example(lambda draw: call(draw.separable()), degree=2),
     "benchmarks.published.lobes.Remainder": example(
@@ -871,33 +768,8 @@ EXAMPLES = {
         # Frames have derivatives along rotations only; see sphere.rotation.
         gradient=("brdf", "excess", "eye"),
     ),
-    "systems.dynamic.set_relight.radiance": example(
-        lambda draw: call(
-            each := draw.regions(),
-            (draw.changing(),),
-            (draw.material(),),
-            draw.light(8),
-            eye=draw.above(each.region[0].terms),
-        ),
-        # The BRDFs' light factors are in the transport.
-        gradient=("materials", "light", "eye"),
-        texels=3,
-    ),
-    "systems.bounces.tensor.scales": example(lambda draw: call((draw.normal(3, 1, 2), draw.normal(2, 3)))),
-    "systems.bounces.relight.radiance": example(
-        lambda draw: call(
-            each := draw.regions(),
-            draw.transfer(len(each.place)),
-            (draw.changing(),),
-            (draw.material(),),
-            draw.light(8),
-            eye=draw.above(each.region[0].terms),
-        ),
-        gradient=("materials", "light", "eye"),
-        texels=3,
-    ),
+    "systems.bounces.tensor.scales": example(lambda draw: call((draw.normal(4, 2), draw.normal(2, 3)))),
     "systems.lobe.table.traced_share": example(lambda draw: call(10 + 10 * draw.uniform(5))),
-    "systems.bounces.relight.area_mean": example(lambda draw: call(draw.normal(5, 2, 3), draw.uniform(5))),
     "systems.bounces.gather.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
     "systems.lamps.relight.ray_share": example(
         lambda draw: call(draw.uniform(5, low=2, high=90), draw.uniform(5, low=0.05, high=0.5))

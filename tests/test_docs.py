@@ -110,7 +110,6 @@ def small(coarse: None, bound) -> Iterator[None]:
             (prt.separable.factor, {"resolution": 8, "terms": 8}),
             (prt.harmonic.tabulate, {"resolution": 8, "error": 1.0}),
             (prt.lobe.tabulate, {"resolution": 8, "lobes": 4}),
-            (prt.bounces.factor, {"functions": 2, "terms": 4, "resolution": 8}),
             (prt.scene.mesh.ground_plane, {"vertices": 100}),
             (prt.bounces.precompute, {"edge": 2, "components": 8, "modes": 8}),
         ):
@@ -130,7 +129,7 @@ def small(coarse: None, bound) -> Iterator[None]:
 
 def _with_size() -> list:
     systems = [prt.harmonic.precompute, prt.harmonic.precompute_diffuse, prt.lobe.precompute, prt.dynamic.precompute]
-    systems += [prt.dynamic.precompute_sets, prt.separable.precompute, prt.bounces.precompute]
+    systems += [prt.separable.precompute, prt.bounces.precompute]
     systems += [prt.visibility.precompute, prt.precompute]
     return [*systems, prt.load_environment, prt.scene.builtin.daylight, prt.scene.builtin.studio]
 

@@ -201,7 +201,6 @@ def constructors() -> dict[str, Verb]:
             normal_texture=color,
         ),
         "Blend": Verb(prt.Blend, weight=np.ones((12, 1, 3)), parameter=(np.ones(12),)),
-        "Material": Verb(_material, weight=[1.0], diffuse=0.5, specular=0.5),
         "Picture": Verb(_pictured, image=np.ones((8, 8, 3)), mask=None, exposure=1.0, saturation=None, camera=camera()),
     }
     for name, values in {
@@ -230,11 +229,6 @@ def constructors() -> dict[str, Verb]:
     }.items():
         result[name] = Verb(functools.partial(_values, getattr(prt.brdf, name)), **values)
     return result
-
-
-def _material(**given: Any) -> Any:
-    """A material that a region uses."""
-    prt.dynamic.set_relight.check_material(0, prt.dynamic.Material(**given), 1, 12)
 
 
 def _pictured(**given: Any) -> Any:

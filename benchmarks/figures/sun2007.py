@@ -16,7 +16,7 @@ from benchmarks import harness
 from benchmarks.figures import drawing
 from benchmarks.figures.run import Clock, Run
 from benchmarks.published import maps
-from benchmarks.published.lobes import mirror_lobes
+from benchmarks.published.lobes import BrdfSet, SetMember, mirror_lobes
 from benchmarks.published.tensors import hooi
 from jaxprt import dynamic, image
 from jaxprt.brdf import navigation
@@ -89,15 +89,10 @@ def sharpest(brdfs: Sequence, resolution: int, terms: int) -> dict[str, float]:
 
 
 def separated(run: Run, brdfs: Sequence, angles: tuple[int, ...]) -> LobeBrdf:
-    """The published lobes of a set; those of each BRDF are kept in the store."""
+    """The published lobes of a set, which the store keeps."""
     nodes = 8 if run.quick else NODES
-
-    def one(brdf):
-        f0, roughness = place_of(brdf)
-        name = f"mirror_{len(angles)}_{nodes}_{f0:.4g}_{roughness:.4g}"
-        return run.kept(name, lambda: mirror_lobes(brdf, angles=angles, resolution=nodes))
-
-    return dynamic.separate(brdfs, separator=one)
+    name = f"mirror_{len(angles)}_{nodes}_{len(brdfs)}"
+    return run.kept(name, lambda: mirror_lobes(BrdfSet.of(brdfs), angles=angles, resolution=nodes))
 
 
 def samples(brdfs: Sequence, table: LobeBrdf | None, *, resolution: int) -> tuple[jax.Array, float]:
@@ -144,10 +139,14 @@ def sampled_lobes(tensor: jax.Array, direction: jax.Array) -> jax.Array:
 
 def reflected(brdfs: Sequence, table: LobeBrdf | None, *, resolution: int) -> tuple[jax.Array, float]:
     """What the BRDFs reflect of natural light, less the lobes, and the squared norm of the whole."""
-    found = dynamic.reflected.reflect(brdfs, table, resolution=resolution)
-    inside = np.flatnonzero(np.asarray(found.area))
-    tensor = found.tensor[:, 0, inside] * jnp.sqrt(found.area[inside])[:, None]
-    return tensor, float(found.whole)
+    lobes = None
+    if table is not None:  # an axis of the one BRDF, whose channels are the set
+        rows = table.mean[:, :, None], table.scale[:, None], table.weight[:, :, None], table.diffuse[:, None]
+        lobes = LobeBrdf(*rows, (jnp.zeros(1),), table.error)
+    sent = dynamic.reflected.reflect([BrdfSet.of(brdfs)], lobes, resolution=resolution)
+    inside = np.flatnonzero(np.asarray(sent.area))
+    tensor = sent.tensor[0][:, inside] * jnp.sqrt(sent.area[inside])[:, None]
+    return tensor, float(sent.whole)
 
 
 def settings(tensor: jax.Array, whole: float, sets: Sequence[int], terms: Sequence[int]) -> dict:
@@ -228,26 +227,22 @@ def figure_6(run: Run) -> Iterator[dict[str, Any]]:
     ball = builtin.sphere(rings=rings, sectors=2 * rings)
     view = camera.orbit(ball, elevation=0.2, width=edge, height=edge)
     number = np.flatnonzero(np.sum(np.asarray(ball.normal) * (np.asarray(view.eye) - np.asarray(ball.position)), 1) > 0)
-    sets: dict[str, Any] = {"no lobes": None}
+    sets: dict[str, Any] = {"no lobes": 0}
     for count in (1, 4) if run.quick else (1, 2, 3, 4):
         sets[" ".join(f"{k}°" for k in ANGLES[:count])] = separated(run, brdfs, ANGLES[:count])
+    ranks = (2, 4, 4) if run.quick else (4, 8, 8)
     made = {
-        name: dynamic.factor(
-            brdfs,
-            each,
-            ranks=(2, 4, 4) if run.quick else (4, 8, 8),
-            resolution=resolution,
-        )
-        for name, each in sets.items()
+        name: dynamic.tabulate(BrdfSet.of(brdfs), lobes=lobes, ranks=ranks, resolution=resolution)
+        for name, lobes in sets.items()
     }
     rows, captions = [], []
     for material in chosen:
         exact = drawing.unshadowed(ball, family.brdf[material], light, view.eye, number)
         name = f"{family.name[material]}, m = {place_of(family.brdf[material])[1]:.3g}"
         radiance, row, titles = {"exact": exact}, [], []
-        for lobes, factored in made.items():
-            mixed = factored.at(jnp.zeros(len(brdfs)).at[members.index(material)].set(1))
-            radiance[lobes] = drawing.unshadowed(ball, mixed, light, view.eye, number)
+        for lobes, table in made.items():
+            member = SetMember(table, jnp.asarray(members.index(material)))
+            radiance[lobes] = drawing.unshadowed(ball, member, light, view.eye, number)
         for lobes, color in radiance.items():
             wrong = float(np.linalg.norm(color - exact) / np.linalg.norm(exact))
             row.append(np.asarray(image.render(ball, jnp.zeros((len(ball.position), 3)).at[number].set(color), view)))

@@ -1,12 +1,12 @@
 """Published lobes: fixed widths around the mirror direction; and the rest of a BRDF, for low-rank terms."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxprt.compile import jit
 from jaxprt.decompose import mixture
@@ -88,3 +88,38 @@ class Remainder(eqx.Module):
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value in 1/sr: the BRDF minus the lobes divided by the cosine of wi, which is clamped to at least 0.001."""
         return self.brdf(wi, wo) - self.lobe(wi, wo) / jnp.maximum(wi[..., 2:], _GRAZING)
+
+
+class BrdfSet(eqx.Module):
+    """A set of gray BRDFs of one model, as the channels of one BRDF.
+
+    Attributes:
+        model: The model; its parameters have a leading axis along the set.
+    """
+
+    model: Callable
+
+    @classmethod
+    def of(cls, brdfs: Sequence[Callable]) -> "BrdfSet":
+        """The set of some BRDFs of one class."""
+        return cls(jax.tree.map(lambda *leaf: jnp.stack(leaf), *brdfs))
+
+    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b m"]:
+        """Values in 1/sr, one for each BRDF of the set."""
+        return jnp.moveaxis(jax.vmap(lambda brdf: brdf(wi, wo))(self.model)[..., 0], 0, -1)
+
+
+class SetMember(eqx.Module):
+    """One channel of a BRDF, as a gray BRDF.
+
+    Attributes:
+        brdf: BRDF (wi, wo) -> value [*b m].
+        number: Index of the channel.
+    """
+
+    brdf: Callable
+    number: Int[Array, ""]
+
+    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b 1"]:
+        """Value in 1/sr."""
+        return self.brdf(wi, wo)[..., self.number, None]

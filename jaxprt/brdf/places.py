@@ -4,7 +4,6 @@ Weights are not negative and sum to one. `jaxprt.brdf.navigation` uses them to m
 """
 
 import functools
-import itertools
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
@@ -50,11 +49,6 @@ class Line(eqx.Module):
         low, upper = _neighbors(knot, self.chart(_check_coordinate(coordinate, ())), len(knot))
         return jnp.zeros(len(knot), upper.dtype).at[low].set(1 - upper).at[low + 1].set(upper)
 
-    @property
-    def pairs(self) -> Int[np.ndarray, "p 2"]:
-        """The pairs of BRDFs that some place has weights for, the lower number first."""
-        return np.stack([np.arange(len(self.knot) - 1), np.arange(1, len(self.knot))], -1)
-
     def inside(self, coordinate: Float[Array, ""]) -> Bool[Array, ""]:
         """Whether the coordinate is between the first and the last knot, inclusive."""
         return (self.knot[0] <= coordinate) & (coordinate <= self.knot[-1])
@@ -89,11 +83,6 @@ class Plane(eqx.Module):
             ValueError: There are not two coordinates.
         """
         return _weight(self, _check_coordinate(coordinate, (2,)))
-
-    @property
-    def pairs(self) -> Int[np.ndarray, "p 2"]:
-        """The pairs of BRDFs that some place has weights for, the lower number first."""
-        return _pairs(np.asarray(self.triangle))
 
     def inside(self, coordinate: Float[Array, "2"]) -> Bool[Array, ""]:
         """Whether the coordinate is inside of the boundary or on it, up to rounding."""
@@ -133,19 +122,6 @@ class Columns(eqx.Module):
             ValueError: There are not two coordinates.
         """
         return _column_weight(self, _check_coordinate(coordinate, (2,)))
-
-    @property
-    def pairs(self) -> Int[np.ndarray, "p 2"]:
-        """The pairs of BRDFs that some place has weights for, the lower number first."""
-        height = np.asarray(self.chart(self.point), np.float64)[:, 1]
-        column = [rows[:count] for rows, count in zip(np.asarray(self.order), np.asarray(self.count), strict=True)]
-        corners = []
-        for sides in itertools.pairwise(column):
-            knot = np.unique(height[np.concatenate(sides)])
-            middle = (knot[1:] + knot[:-1]) / 2
-            low = [np.clip(np.searchsorted(height[rows], middle) - 1, 0, len(rows) - 2) for rows in sides]
-            corners.append(np.stack([rows[n + up] for rows, n in zip(sides, low, strict=True) for up in (0, 1)], -1))
-        return _pairs(np.concatenate(corners))
 
     def inside(self, coordinate: Float[Array, "2"]) -> Bool[Array, ""]:
         """Whether both coordinates are between their ends, inclusive."""
@@ -234,13 +210,6 @@ def columns(
     order = np.stack([np.pad(group, (0, most - len(group)), mode="edge") for group in groups])
     order, count = (jax.device_put(np.asarray(group, np.int32)) for group in (order, [len(group) for group in groups]))
     return Columns(jax.device_put(point), order, count, chart)
-
-
-def _pairs(group: Int[np.ndarray, "g n"]) -> Int[np.ndarray, "p 2"]:
-    """All pairs of indices within groups, each once."""
-    first, second = np.triu_indices(group.shape[1], 1)
-    pair = np.sort(np.stack([group[:, first], group[:, second]], -1).reshape(-1, 2), -1)
-    return np.unique(pair, axis=0)
 
 
 def _split(scaled: np.ndarray, rounding: float) -> list[np.ndarray]:

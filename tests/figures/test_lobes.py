@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.published.lobes import Remainder, mirror_lobes
-from jaxprt import lobe
+from benchmarks.published.lobes import BrdfSet, Remainder, SetMember, mirror_lobes
+from jaxprt import dynamic, lobe
 from jaxprt.brdf import AshikhminShirley, CookTorrance, Lambert
 from tests.upper import directions, nodes, upper
 
@@ -102,3 +102,16 @@ def test_lobes_and_their_remainder_are_the_brdf(close):
     close(np.asarray(value(rest, wi, wo)) + value(table, wi, wo) / np.asarray(wi)[:, 2:], value(COLORED, wi, wo))
     grazing = directions((np.pi / 2 - 1e-6, 0.3), (np.pi / 2, 0.1))
     assert np.isfinite(np.asarray(value(rest, grazing, np.asarray(wo)[:2]))).all()
+
+
+def test_published_lobes_leave_what_a_tensor_can_carry():
+    models = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in (0.25, 0.4, 0.6)]
+    brdfs = BrdfSet.of(models)
+    wi, wo = upper(5, 20), upper(6, 20)
+    for number, model in enumerate(models):
+        np.testing.assert_allclose(SetMember(brdfs, jnp.asarray(number))(wi, wo), model(wi, wo), rtol=1e-5)
+    lobes = mirror_lobes(brdfs, resolution=4)
+    assert lobes.weight.shape[:2] == (3, 4)
+    options = {"ranks": (3, 16, 16), "resolution": RESOLUTION}
+    error = [dynamic.tabulate(brdfs, lobes=each, **options).error for each in (lobes, 0)]
+    assert error[0] < error[1]

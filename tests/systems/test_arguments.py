@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxprt as prt
-from jaxprt import bright_texels, dynamic, harmonic, lobe, reference, separable
+from jaxprt import bounces, bright_texels, harmonic, lobe, reference, separable
 from jaxprt.brdf import Lambert
 from jaxprt.scene import Environment, builtin
 from jaxprt.systems.harmonic import HarmonicBrdf, TransferMatrix, TransferVector
@@ -42,7 +42,7 @@ WANTED = {
     "jaxprt.harmonic.precompute": [lambda: prt.radiance(harmonic.HarmonicSystem(VECTOR, TABLE), COEFFICIENT, eye=EYE)],
     "jaxprt.separable.factor": [
         lambda: separable.SeparableSystem(SPARSE, MODEL),
-        lambda: dynamic.set_relight._check(0, None, MODEL, None, 2),
+        lambda: bounces.precompute(MESH, [MODEL]),
     ],
     "jaxprt.lobe.tabulate": [
         lambda: lobe.LobeSystem(PYRAMID, MODEL),

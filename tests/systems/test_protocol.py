@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import jaxprt as prt
-from jaxprt import bounces, bright_texels, dynamic, harmonic, lobe, separable, visibility
+from jaxprt import bright_texels, dynamic, harmonic, lobe, separable, visibility
 from jaxprt.brdf import CookTorrance, Lambert, MetallicRoughness
 from jaxprt.scene import Environment, Mesh, builtin
 from jaxprt.scene.mesh import grid_face, join, make_mesh, split
@@ -28,7 +28,6 @@ pytestmark = pytest.mark.usefixtures("coarse")
 SIZE = 8
 EYE = jnp.array([1.5, 2.0, 2.5])
 GLOSSY = CookTorrance(diffuse=0.5, specular=0.5, roughness=0.5, f0=0.4)
-MEMBERS = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.4) for m in (0.4, 0.6)]  # without diffuse parts
 MODELS = {
     "white": Lambert(1.0),
     "glossy": GLOSSY,
@@ -103,13 +102,6 @@ def factored(model: str) -> separable.SeparableBrdf:
 
 
 @functools.cache
-def members() -> dynamic.BrdfSet:
-    """MEMBERS as a set, with their lobes."""
-    free = functools.partial(lobe.tabulate, lobes=4, resolution=8)
-    return dynamic.factor(MEMBERS, dynamic.separate(MEMBERS, separator=free))
-
-
-@functools.cache
 def lobe_table(model: str) -> lobe.LobeBrdf:
     """Lobes of a BRDF."""
     return lobe.tabulate(MODELS[model], lobes=6, resolution=8)
@@ -119,12 +111,6 @@ def lobe_table(model: str) -> lobe.LobeBrdf:
 def harmonic_table(model: str) -> harmonic.HarmonicBrdf:
     """A BRDF in harmonics."""
     return harmonic.tabulate(MODELS[model], degree=4, error=0.5)
-
-
-@functools.cache
-def members_along() -> dynamic.BrdfSet:
-    """What the members reflect on to other surfaces."""
-    return bounces.factor(MEMBERS, terms=6, resolution=16)
 
 
 @functools.cache
@@ -181,23 +167,6 @@ def dynamics(name: str, model: str) -> tuple[prt.System, Any]:
     return dynamic.DynamicSystem(transport, tensor(model)), None
 
 
-@functools.cache
-def changing(name: str, model: str) -> tuple[dynamic.SetSystem, Any]:
-    brdfs = [members()] * (1 + (name == "scene"))
-    transport = dynamic.precompute_sets(mesh(name), brdfs, size=SIZE, components=16, modes=32, keep=384, progress=False)
-    white = model == "white"
-    material = dynamic.Material(np.full(2, 0.5), 1.0 if white else 0.5, 0.0 if white else 0.5)
-    return dynamic.SetSystem(transport, brdfs), [material] * len(brdfs)
-
-
-@functools.cache
-def reflected(name: str, model: str) -> tuple[prt.System, Any]:
-    direct, materials = changing(name, model)
-    basis = [members_along()] * len(materials)
-    options = {"components": 8, "modes": 12, "edge": 2, "size": 4}
-    return bounces.BouncesSystem(bounces.precompute(mesh(name), basis, **options), direct), materials
-
-
 def of_parts(name: str, model: str, **options) -> tuple[prt.System, Any]:
     """A scene whose parts are the regions of a mesh, all with one BRDF."""
     parts = [prt.Part(str(n), part, MODELS[model]) for n, part in enumerate(split(mesh(name)))]
@@ -222,8 +191,6 @@ SYSTEMS = {
     "lobe, matte": Promise(mattes, 0.02, None),
     "lobe, bright texels": Promise(bright, 0.02, 0.1, linear=False),
     "dynamic": Promise(dynamics, 0.02, 0.1),
-    "dynamic, regions": Promise(changing, 0.02, None, linear=False),
-    "bounces": Promise(reflected, None, None),
     "scene": Promise(of_parts, 0.02, 0.1),
     "scene with bounces": Promise(between_parts, None, None),
     "lobe and matte": Promise(total, None, None),
@@ -346,7 +313,7 @@ def test_white_metals_in_a_white_furnace_send_what_single_scattering_reflects(na
 @each_system
 def test_radiance_is_that_of_the_exact_sum_vertex_by_vertex(name, close):
     if SYSTEMS[name].error is None:
-        pytest.skip("tests/systems/dynamic and bounces hold these to the exact sum of their own materials")
+        pytest.skip("matte, or with reflected light")
     case, environment = case_of(name), light()
     exact = prt.reference.integrate(
         jnp.asarray(seen("scene").seen(np.arange(case.system.vertices))),
@@ -545,7 +512,7 @@ def test_a_mesh_of_one_triangle_is_lit(name):
     color = color_of(case, light())
     assert color.shape == (3, 3)
     assert np.isfinite(color).all()
-    assert color.any() == (not name.startswith("bounces"))
+    assert color.any()
 
 
 @pytest.mark.long
@@ -653,13 +620,10 @@ def test_what_are_no_devices_and_what_has_no_vertices_are_refused():
         prt.shard(light(), [here])
 
 
-OF_REGIONS = dynamic.SetSystem | bounces.BouncesSystem | prt.RelitScene
-
-
 def at_points(case: Case, triangle: np.ndarray, weight: np.ndarray) -> tuple[prt.System, np.ndarray]:
-    """A system at points of some triangles, and their order there: systems of regions take one list for each."""
+    """A system at points of some triangles, and their order there: scenes take one list for each part."""
     face, region = np.asarray(case.mesh.face)[triangle], np.asarray(case.mesh.region)
-    if not isinstance(case.system, OF_REGIONS):
+    if not isinstance(case.system, prt.RelitScene):
         return case.system.at(on_triangles(case.mesh.face, triangle, weight)), np.arange(len(triangle))
     lists, order = [], []
     for number in range(region.max() + 1):
@@ -691,7 +655,7 @@ def inside_triangles(case: Case) -> tuple[np.ndarray, np.ndarray]:
 @each_system
 def test_radiance_at_points_is_the_exact_sum_there(name, close):
     if SYSTEMS[name].error is None:
-        pytest.skip("tests/systems/dynamic and bounces hold these to the exact sum of their own materials")
+        pytest.skip("matte, or with reflected light")
     case = case_of(name)
     triangle, weight = inside_triangles(case)
     points = on_triangles(case.mesh.face, triangle, weight)
@@ -745,7 +709,7 @@ def test_points_outside_of_triangles_are_refused(name):
     for corner, weight, message in OUTSIDE:
         wrong = Points(jnp.asarray(corner), jnp.asarray(weight))
         with pytest.raises(ValueError, match=message):
-            system.at([wrong] * 2 if isinstance(system, OF_REGIONS) else wrong)
+            system.at([wrong] * 2 if isinstance(system, prt.RelitScene) else wrong)
 
 
 @each_system
@@ -765,7 +729,7 @@ def test_what_is_of_another_kind_is_refused_by_what_makes_it(name):
 @each_system
 @pytest.mark.usefixtures("unchecked")
 def test_lights_of_another_size_are_refused(name):
-    if "harmonic" in name or name.startswith("bounces"):
+    if "harmonic" in name:
         pytest.skip("takes lights of any size that it can reduce")
     with pytest.raises(ValueError, match=r"light('s faces)? must .*\b8\b.* got .*\b16\b"):
         case_of(name).system.light(Environment(jnp.ones((6, 16, 16, 3))))

@@ -16,7 +16,6 @@ from jaxprt.scene.mesh import Mesh, areas
 from jaxprt.systems.bounces import functions, gather, jobs, patches
 from jaxprt.systems.bounces.patches import Patches
 from jaxprt.systems.bounces.tensor import SecondBounce, TransferTensor, scales, twice
-from jaxprt.systems.dynamic import BrdfSet
 from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.visibility import members
@@ -32,7 +31,7 @@ _SAMPLE = 8  # number of clusters from which the worth of a bounce is estimated
 @require.arguments(**PRECOMPUTE)
 def precompute(
     mesh: Mesh,
-    brdfs: Sequence[BrdfSet | SeparableBrdf],
+    brdfs: Sequence[SeparableBrdf],
     *,
     weights: Sequence[Float[Array, "_ _"] | None] | None = None,
     lamps: LampTransport | None = None,
@@ -52,10 +51,10 @@ def precompute(
 
     Args:
         mesh: The whole scene, which reflects light onto itself.
-        brdfs: BRDFs along light paths, for each region in the order of their numbers: a set from
-            `jaxprt.bounces.factor`, or one factored BRDF that cannot change.
+        brdfs: BRDFs along light paths, for each region in the order of their numbers, from `jaxprt.separable.factor` or
+            `jaxprt.bounces.functions.shared`.
         weights: For each region, typical weights of the BRDF's channels k in each color, [k, c]. They are used to
-            estimate `worth`. None for a set, and for a BRDF whose channels are colors.
+            estimate `worth`. None for a BRDF whose channels are colors.
         lamps: Transport of lamps to the vertices of the mesh, whose light is reflected too; None without lamps.
         bounces: Number of times that light is reflected, or "all" for as many as contribute. Bounces after the second
             are diffuse, between patches.
@@ -74,9 +73,9 @@ def precompute(
         The tensor for all vertices.
 
     Raises:
-        TypeError: `mesh` is not a `Mesh`, `brdfs` is not a list, or a BRDF is neither a set nor factored.
-        ValueError: There is not one BRDF for each region; weights have another number of channels or are not finite; a
-            set has no terms, or has lobes; `lamps` has other vertices than the mesh; `bounces` is neither "all" nor a
+        TypeError: `mesh` is not a `Mesh`, `brdfs` is not a list, or a BRDF is not factored.
+        ValueError: There is not one BRDF for each region; weights have another number of channels or are not finite;
+            `lamps` has other vertices than the mesh; `bounces` is neither "all" nor a
             whole number of at least 1; `least` is not in [0, 1); another number is below 1; or `edge` is not a power
             of two.
 
@@ -88,7 +87,7 @@ def precompute(
     _check_sizes(bounces, least, components, modes, edge, size, patches)
     if lamps is not None:
         require.length("vertices of the lamps' transport", lamps.position, len(mesh.position))
-    factor = tuple(brdf.factor if isinstance(brdf, BrdfSet) else functions.fixed_weights(brdf) for brdf in brdfs)
+    factor = tuple(map(functions.fixed_weights, brdfs))
     white = np.concatenate([_white(*pair) for pair in zip(factor, weights, strict=True)])
     parts = {"lamps": 0 if lamps is None else lamps.lamps, "white": white, "scale": np.asarray(scales(factor))}
     parts["function"] = np.arange(len(white))
@@ -124,7 +123,7 @@ def precompute(
 
 def _job(
     mesh: Mesh,
-    brdfs: Sequence[BrdfSet | SeparableBrdf],
+    brdfs: Sequence[SeparableBrdf],
     region: np.ndarray,
     edge: int,
     lamps: LampTransport | None,
@@ -223,18 +222,14 @@ def _regions(mesh: Mesh, brdfs: Sequence) -> np.ndarray:
     if not isinstance(mesh, Mesh) or not isinstance(brdfs, Sequence):
         raise TypeError(f"mesh must be a Mesh and brdfs a list, got {type(mesh).__name__} and {type(brdfs).__name__}")
     for number, each in enumerate(brdfs):
-        if not isinstance(each, BrdfSet | SeparableBrdf):
-            raise TypeError(
-                f"the BRDF of region {number} must be from jaxprt.bounces.factor or separable.factor, got "
-                f"{type(each).__name__}"
-            )
+        require.kind(f"the BRDF of region {number}", each, SeparableBrdf, source="jaxprt.separable.factor")
     numbers = np.unique(np.asarray(mesh.region))
     if len(brdfs) != len(numbers):
         raise ValueError(f"brdfs must be one for each of the regions {numbers.tolist()}, got {len(brdfs)}")
     return numbers
 
 
-def _check_weights(weights: Sequence[Array | None], brdfs: Sequence[BrdfSet | SeparableBrdf]) -> None:
+def _check_weights(weights: Sequence[Array | None], brdfs: Sequence[SeparableBrdf]) -> None:
     """Refuses weights of other regions or channels."""
     if len(weights) != len(brdfs):
         raise ValueError(
@@ -243,8 +238,6 @@ def _check_weights(weights: Sequence[Array | None], brdfs: Sequence[BrdfSet | Se
     for number, (each, brdf) in enumerate(zip(weights, brdfs, strict=True)):
         if each is None:
             continue
-        if isinstance(brdf, BrdfSet):
-            raise ValueError(f"the weights of region {number} must be None because it has a set of BRDFs, got an array")
         shape, channels = np.shape(each), brdf.view_map.shape[-1]
         if len(shape) != 2 or shape[0] != channels:
             raise ValueError(f"the weights of region {number} must be [{channels} channels, c], got {list(shape)}")
@@ -316,9 +309,7 @@ def _second(
 
 
 def _white(factor: Array, channel: Array | None) -> np.ndarray:
-    """Weights of the functions of a region: white for a set, otherwise those of its BRDF in the brightest color."""
-    if factor.ndim > 2:
-        return np.append(np.zeros(factor.shape[-1], np.float32), np.float32(1))
+    """Weights of the functions of a region, those of its BRDF in the brightest color."""
     weight = np.asarray(factor) if channel is None else np.asarray(factor) @ np.asarray(channel)
     return weight[:, np.argmax(np.abs(weight).sum(0))] if len(weight) else np.zeros(0, np.float32)
 

@@ -1,4 +1,4 @@
-"""BRDFs along light paths: a few functions whose weighted sums represent all BRDFs that a region can have.
+"""BRDFs along light paths: a few functions whose weighted sums represent all BRDFs that a part can have.
 
     f_h(wi, wo) ~ sum_p H(h, p) f_p(wi, wo),    f_p(wi, wo) = sum_k g_kp(wo) u_k(wi)
 
@@ -17,94 +17,27 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxprt.brdf.places import Columns, Line, Plane
 from jaxprt.compile import jit
 from jaxprt.decompose import tucker
 from jaxprt.sphere import harmonics, hemisphere
-from jaxprt.systems import dynamic
-from jaxprt.systems.bounces import between
-from jaxprt.systems.dynamic import BrdfSet
+from jaxprt.systems.dynamic import reflected
 from jaxprt.systems.dynamic.reflected import Reflected
-from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.separable import SeparableBrdf
 
 _RINGS, _SECTORS = 32, 64  # quadrature of a bilinear map times low-order harmonics
 _SMOOTH = 5  # degree of smoothing: 4 loses more of the light from the horizon, 6 more of all light
-_FUNCTIONS = 4  # default number of functions of a set
-_TOGETHER = 64  # largest number of BRDFs, with those halfway, for which functions are chosen; and batch of integration
 _RANK = 1e-3  # smaller singular values, relative to the largest, are rounding in float32
 _NOTHING = 1e-3  # smaller singular values, relative to the largest: a color is a multiple of another
-
-
-def factor(
-    brdfs: Sequence[Callable],
-    *,
-    lobe: LobeBrdf | None = None,
-    navigation: Line | Plane | Columns | None = None,
-    functions: int | None = None,
-    terms: int = 32,
-    resolution: int = 32,
-) -> BrdfSet:
-    """A set of BRDFs for light paths: functions that represent the set, factored over the light, without lobes.
-
-    The decomposition minimizes the squared error of the light that the BRDFs reflect under light with a natural
-    spectrum, smoothed over outgoing directions to degree 5. Views are not compressed, because transport does not depend
-    on their number. Between BRDFs of the set, the functions' weights approximate the true BRDF, which is the model with
-    interpolated parameters, or moved lobes; see `jaxprt.bounces.between`.
-
-    Args:
-        brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr on local directions, without diffuse parts.
-        lobe: Lobes of the BRDFs, from `jaxprt.dynamic.separate`. If the BRDFs are not of one model, they are
-            interpolated by moving these lobes; without lobes they are interpolated linearly.
-        navigation: The navigation through the set, which determines the pairs of BRDFs that can be mixed. If None, all
-            pairs; a set of more than 64 BRDFs is then interpolated linearly.
-        functions: Number of functions that represent the set. If None, four, or fewer if there are fewer BRDFs (with
-            those halfway between pairs) times colors.
-        terms: Number of light factors that the functions share. The cost of precomputed bounces is proportional to it.
-        resolution: Edge of the square maps in texels.
-
-    Returns:
-        The set. Its error is the relative error of the smoothed light that its BRDFs reflect.
-
-    Raises:
-        ValueError: There are no BRDFs, lobes of another number of BRDFs, or different numbers of colors; a BRDF is
-            negative or not finite; `functions` or `terms` is out of range; `resolution` is below 4; or the navigation
-            is for another number of BRDFs.
-
-    Reference: Sun et al. 2007, section 3.1, with the natural power spectrum in place of the Frobenius norm.
-    """
-    colors = dynamic.brdf_set.check(brdfs, lobe, resolution=resolution)
-    pair = between.pairs(len(brdfs), navigation)
-    middle, moved = between.middles(brdfs, lobe, pair)
-    pair = jnp.asarray(pair[: len(middle)], jnp.int32)
-    # In a small set, functions are chosen for the BRDFs halfway too; a large set is dense enough without them.
-    dense = len(brdfs) + len(middle) > _TOGETHER
-    found, rest = _members(brdfs, [] if dense else middle, moved, pair, resolution)
-    members = len(found.tensor) * colors
-    functions = min(_FUNCTIONS, members) if functions is None else functions
-    _check_count("functions", functions, members)
-    _check_count("terms", terms, found.tensor.shape[3])
-    smooth = _smoothed(found)
-    kinds = min(smooth.shape[1], len(found.area))
-    least = tucker.orient(tucker.truncated(smooth, ranks=(functions, kinds, terms)))
-    view, light = _maps(found, least)
-    rows = [_projected(smooth, least)]
-    for first in range(0, len(middle) if dense else 0, _TOGETHER):
-        part = slice(first, first + _TOGETHER)
-        each = _middles(dynamic.reflected.reflect(middle[part], None, resolution=resolution), rest, pair[part])
-        rows.append(_projected(_smoothed(each), least))
-    along = jnp.concatenate(rows)
-    count = len(brdfs) * colors
-    error = _missed(smooth[:count], along[:count], least)
-    pairs = np.eye(functions * terms, dtype=error.dtype).reshape(functions, terms, -1).swapaxes(1, 2)
-    along = between.quadratic(along.reshape(-1, colors, functions), pair, count=len(brdfs))
-    return BrdfSet(jnp.asarray(pairs), along, view, light, None, dynamic.reflected.stacked(brdfs), error)
 
 
 def shared(
     brdfs: Sequence[Callable], *, functions: int, terms: int = 32, resolution: int = 32
 ) -> tuple[SeparableBrdf, Float[Array, "m c p"]]:
-    """Functions that represent several BRDFs and their colors, chosen as in `factor` but with equal weights of BRDFs.
+    """Functions that represent several BRDFs and their colors, factored over the light, with equal weights of BRDFs.
+
+    The decomposition minimizes the squared error of the light that the BRDFs reflect under light with a natural
+    spectrum, smoothed over outgoing directions to degree 5. Views are not compressed, because transport does not depend
+    on their number.
 
     Args:
         brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr on local directions, all with the same number of colors, without
@@ -121,7 +54,7 @@ def shared(
     Raises:
         ValueError: A BRDF is negative or not finite.
     """
-    found, size = _evened(dynamic.reflected.reflect(brdfs, None, resolution=resolution))
+    found, size = _evened(reflected.reflect(brdfs, None, resolution=resolution))
     smooth, colors = _smoothed(found), found.tensor.shape[1]
     kinds = min(smooth.shape[1], len(found.area))
     ranks = (min(functions, len(smooth)), kinds, min(terms, found.tensor.shape[3]))
@@ -145,34 +78,6 @@ def _evened(found: Reflected) -> tuple[Reflected, Float[Array, " m"]]:
     size = jnp.sqrt(jnp.sum(sent**2, 1))
     size = jnp.where(size > 0, size, 1)
     return found._replace(tensor=found.tensor / size[:, None, None, None]), size
-
-
-def _check_count(name: str, value: int, most: int) -> None:
-    """Refuses values that are not whole numbers from 1 to the tensor's size."""
-    if not isinstance(value, int | np.integer) or not 1 <= value <= most:
-        raise ValueError(f"{name} must be a whole number from 1 to {most} for these BRDFs, got {value}")
-
-
-def _members(
-    brdfs: Sequence[Callable], middle: Sequence[Callable], moved: Sequence[Callable], pair: Array, resolution: int
-) -> tuple[Reflected, Array | None]:
-    """The reflected light of BRDFs and of those halfway between pairs; and the residual of lobes that are moved."""
-    if not moved:
-        return dynamic.reflected.reflect([*brdfs, *middle], None, resolution=resolution), None
-    found = dynamic.reflected.reflect(brdfs, None, resolution=resolution)
-    lobes = dynamic.reflected.reflect([*moved, *middle], None, resolution=resolution)
-    rest = found.tensor - lobes.tensor[: len(brdfs)]
-    if not middle:
-        return found, rest
-    each = _middles(lobes._replace(tensor=lobes.tensor[len(brdfs) :]), rest, pair)
-    return found._replace(tensor=jnp.concatenate([found.tensor, each.tensor])), rest
-
-
-def _middles(found: Reflected, rest: Array | None, pair: Array) -> Reflected:
-    """The reflected light of BRDFs halfway between pairs: that of the moved lobes and the mean residual of the pair."""
-    if rest is None:
-        return found
-    return found._replace(tensor=found.tensor + jnp.mean(rest[pair], 1))
 
 
 @jit
@@ -215,32 +120,18 @@ def _missed(smooth: Float[Array, "n s b"], along: Float[Array, "n h"], least: tu
     return jnp.sqrt(jnp.vdot(sent - smooth, sent - smooth) / jnp.where(whole > 0, whole, 1))
 
 
-def basis(brdf: BrdfSet | SeparableBrdf) -> SeparableBrdf:
-    """The path functions f_p, as the colors of a factored BRDF.
+def basis(brdf: SeparableBrdf) -> SeparableBrdf:
+    """The path functions f_p of a factored BRDF, as the colors of another one.
 
-    Args:
-        brdf: A set with terms: each of its ranks makes a function, and a constant function for the diffuse part
-            follows. Or one factored BRDF: it makes as many functions as its colors need, one if all are multiples of
-            one color.
-
-    Returns:
-        View factors of all functions on light factors that they share.
+    There are as many as its colors need: one if all are multiples of one color.
 
     Raises:
-        ValueError: The set has no terms, or has lobes; or the light maps of the BRDF differ by color.
+        ValueError: The light maps of the BRDF differ by color.
 
     Reference: Sun et al. 2007, section 3.1.
     """
-    if isinstance(brdf, SeparableBrdf):
-        view = jnp.matmul(brdf.view_map, fixed_weights(brdf).T, precision="highest")
-        return SeparableBrdf(brdf.light_map, view, brdf.error, brdf.coordinates)
-    if brdf.lobe is not None or not brdf.core.size:
-        found = "terms of the residual of its lobes" if brdf.core.size else "no terms"
-        raise ValueError(
-            f"light paths need terms of whole BRDFs, got {found}: factor the set with ranks and without lobes"
-        )
-    light, view = _functions(brdf.core, brdf.view_map, brdf.light_map)
-    return SeparableBrdf(light, view, brdf.error, brdf.coordinates)
+    view = jnp.matmul(brdf.view_map, fixed_weights(brdf).T, precision="highest")
+    return SeparableBrdf(brdf.light_map, view, brdf.error, brdf.coordinates)
 
 
 @jit
@@ -271,37 +162,6 @@ def albedo(basis: SeparableBrdf) -> Float[Array, " p"]:
     flux = direction[:, 2] * area
     met = flux @ basis.light(direction)[..., 0]
     return jnp.einsum("d,dkp,k->p", flux / np.pi, basis.view(direction), met)
-
-
-@jit
-def weights(
-    factor: Float[Array, "m *n f h"],
-    weight: Float[Array, " m"],
-    diffuse: Float[Array, " c"],
-    specular: Float[Array, " d"],
-) -> Float[Array, "p e"]:
-    """Weights H of a set's functions for one of its BRDFs, in color if any of the arguments is.
-
-    Between BRDFs of the set, the weights approximate the true BRDF; see `jaxprt.bounces.between`.
-
-    Args:
-        factor: The attribute `factor` of the set, a `jaxprt.dynamic.BrdfSet`.
-        weight: Weight of each BRDF in the set. `jaxprt.brdf.navigation` makes them.
-        diffuse: Albedo of the diffuse part.
-        specular: Factor of the set's BRDF.
-
-    Returns:
-        The weights, with that of the diffuse part last. Differentiable in all arguments but `factor`.
-
-    Raises:
-        ValueError: There is not one weight for each BRDF of the set.
-    """
-    if weight.shape != factor.shape[:1]:
-        raise ValueError(f"weights must be one for each of {len(factor)} BRDFs, got {list(weight.shape)}")
-    sharp = dynamic.brdf_set.combined(factor, weight).T * specular
-    colors = max(sharp.shape[1], len(diffuse))
-    rows = [jnp.broadcast_to(each, (len(each), colors)) for each in (sharp, diffuse[None])]
-    return jnp.concatenate(rows)
 
 
 def fixed_weights(brdf: SeparableBrdf) -> Float[Array, "p c"]:

@@ -203,17 +203,15 @@ class GroupBounces(eqx.Module):
 
         Raises:
             TypeError: `tensor` is not a `TransferTensor`.
-            ValueError: The tensor is of sets, or of other regions or vertices.
+            ValueError: The tensor is of other regions or vertices.
         """
         require.kind("the tensor", tensor, TransferTensor, source="jaxprt.bounces.precompute")
         region, area = np.asarray(tensor.region), np.asarray(tensor.area)
         regions = [np.unique(region[vertex], return_inverse=True) for vertex in vertices]
         numbers = np.concatenate([number for number, _ in regions]).tolist()
-        axes = [factor.ndim for factor in tensor.factor]
-        if axes != [2] * len(numbers):
+        if len(tensor.factor) != len(numbers):
             raise ValueError(
-                f"the tensor must have one factored BRDF for each of {len(numbers)} regions, got {len(axes)} BRDFs, "
-                f"{sum(count > 2 for count in axes)} of them sets"
+                f"the tensor must have a BRDF for each of {len(numbers)} regions, got {len(tensor.factor)}"
             )
         members = []
         for surface, vertex, (number, of_vertex) in zip(group, vertices, regions, strict=True):

@@ -7,7 +7,7 @@ The tensors hold for any light and any BRDFs. For one bounce the light has 6 x 8
 harmonics s in world directions. q counts the functions of all regions, from `jaxprt.bounces.functions`, and H are their
 current weights. For two bounces, off functions q and then p, the light is reduced to 6 x 2 x 2 texels. It arrives
 as 16 harmonics too, whereas the paper treats it as uniform over direction. Vertices are clustered, and
-the tensor of each cluster is decomposed along vertices and light. `jaxprt.bounces.radiance` computes radiance from it.
+the tensor of each cluster is decomposed along vertices and light.
 
 A third bounce of this kind would cost as many times the second as there are functions. Bounces after the second are
 therefore diffuse light between patches; see `jaxprt.bounces.patches`. The effect of textures on the first two is also
@@ -56,14 +56,13 @@ class TransferTensor(eqx.Module):
         region: Number of the region of each vertex.
         area: Surface area that each vertex represents, a third of that of the triangles around it.
         function: Indices of the functions that are kept, among those of all regions.
-        factor: For each region, what determines the weights of its functions: the factors of its set, or the weights of
-            its one BRDF.
+        factor: For each region, the weights of its functions for each channel of its BRDF.
         second: Two bounces; None if not requested, or omitted.
         error: Relative L2 error of each cluster's tensor due to the decomposition, with each function at its largest
             possible weight, and without what the modes by which light is gathered leave out. It is computed as a
             difference of squares: values below 5e-4 are rounding.
-        worth: Contribution of each bounce for white surfaces under uniform light: RMS irradiance relative to the
-            irradiance of an unoccluded surface. Regions with one BRDF use that BRDF. With "all" bounces, the last value
+        worth: Contribution of each bounce under uniform light: RMS irradiance relative to the irradiance of an
+            unoccluded surface. With "all" bounces, the last value
             is that of all bounces after the second together.
         mesh: Fingerprint of the mesh. Transport of another mesh is refused. Empty if the tensor was made by hand.
         patches: Patches that exchange diffuse light, for textures and for bounces after the second; None without.
@@ -77,7 +76,7 @@ class TransferTensor(eqx.Module):
     region: Int[Array, " v"]
     area: Float[Array, " v"]
     function: Int[Array, " q"]
-    factor: tuple[Float[Array, "..."], ...]
+    factor: tuple[Float[Array, "_ _"], ...]
     second: SecondBounce | None
     error: Float[Array, " g"]
     worth: Float[Array, " _"]
@@ -104,9 +103,5 @@ def twice(components: int) -> int:
 
 def scales(factor: Sequence[Array]) -> Float[Array, " q"]:
     """Largest weight of each function, at least a hundredth of the largest of all: half precision holds both."""
-    largest = []
-    for each in factor:
-        size = jnp.abs(each)
-        largest += [jnp.max(size, range(each.ndim - 1)), jnp.ones(1)] if each.ndim > 2 else [jnp.max(size, 1)]
-    whole = jnp.concatenate(largest)
+    whole = jnp.concatenate([jnp.max(jnp.abs(weight), 1) for weight in factor])
     return jnp.maximum(whole, _LEAST * jnp.max(whole, initial=0))

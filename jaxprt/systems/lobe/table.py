@@ -124,7 +124,7 @@ class LobeBrdf(eqx.Module):
         result = self
         for knot, value in zip(self.knot, parameter, strict=True):
             low, upper = grid.neighbors(grid.place(knot, value), size=len(knot))
-            result = mean(result, jnp.zeros_like(knot).at[low].set(1 - upper).at[low + 1].set(upper))
+            result = _mean(result, jnp.zeros_like(knot).at[low].set(1 - upper).at[low + 1].set(upper))
         return result
 
     def lookup(self, wo: Float[Array, "v 3"], *parameter: Float[Array, " v"]) -> Lobes:
@@ -185,7 +185,7 @@ class LobeBrdf(eqx.Module):
 
 
 @jit
-def mean(table: LobeBrdf, weight: Float[Array, " m"]) -> LobeBrdf:
+def _mean(table: LobeBrdf, weight: Float[Array, " m"]) -> LobeBrdf:
     """Weighted mean of the lobes along the first parameter axis of a table, which is removed.
 
         w = sum_h a_h w_h,    (m, log k) = sum_h a_h w_h (m_h, log k_h) / w
@@ -504,7 +504,7 @@ def _entry(row: Float[Array, "v r"], *, lobes: int) -> _Entry:
 
 
 def _between_knots(low: _Entry, high: _Entry, upper: Float[Array, " v"]) -> _Entry:
-    """Entries interpolated between two knots by the formula of `mean`."""
+    """Entries interpolated between two knots by the formula of `_mean`."""
     strength = [
         jnp.maximum(share[:, None] * jnp.sum(entry.weight, 1), 0) + _TINY
         for share, entry in ((1 - upper, low), (upper, high))

@@ -21,9 +21,9 @@ from jaxprt.brdf.varying import Channels
 from jaxprt.relit import paths, reflection
 from jaxprt.relit.channels import of_part
 from jaxprt.scene import Environment, Mesh, TexturedMaterial, builtin
-from jaxprt.scene.mesh import join, make_mesh
-from jaxprt.sphere import directions
+from jaxprt.scene.mesh import ground_plane, join, make_mesh
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart
+from tests.systems.bounces.reflected import of_regions, radiance
 
 pytestmark = pytest.mark.usefixtures("coarse")
 
@@ -58,12 +58,7 @@ class Reflected(NamedTuple):
     bounces: GroupBounces
 
     def radiance(self, light: Environment, materials: list | None = None) -> np.ndarray:
-        blends = [None] * len(self.bounces.group) if materials is None else materials
-        arriving = self.bounces.shade(self.bounces.light(light), blends)
-        rows = zip(self.bounces.group, arriving, blends, strict=True)
-        colors = [np.asarray(part.combine(lit, part.view(EYE, blend))) for part, lit, blend in rows]
-        most = max(each.shape[1] for each in colors)
-        return np.concatenate([np.broadcast_to(each, (len(each), most)) for each in colors])
+        return np.asarray(radiance(self.bounces, light, EYE, materials))
 
 
 def made(mesh: Mesh, brdfs: list, *, count: int = 1, terms: int = 8) -> Reflected:
@@ -71,12 +66,7 @@ def made(mesh: Mesh, brdfs: list, *, count: int = 1, terms: int = 8) -> Reflecte
     factored = [separable.factor(each, terms=terms, resolution=16) for each in brdfs]
     sizes = {"components": 40, "modes": 24, "edge": 2, "size": 16}
     tensor = bounces.precompute(mesh, factored, bounces=count, **sizes)
-    frame = directions.frame(mesh.normal, mesh.tangent)
-    own = [np.asarray(mesh.region) == number for number in range(len(brdfs))]
-    tables = [harmonic.tabulate(each, degree=3, error=0.5) for each in brdfs]
-    parts = zip(own, tables, strict=True)
-    groups = [ReflectingPart(mesh.position[at], frame[at], table) for at, table in parts]
-    return Reflected(GroupBounces.make(tensor, groups, [np.flatnonzero(at) for at in own]))
+    return Reflected(of_regions(mesh, brdfs, tensor))
 
 
 def test_parts_of_one_group_send_what_they_send_in_groups_of_their_own(close):
@@ -105,6 +95,26 @@ def test_a_bowl_has_the_light_of_the_closed_form():
     once = ALBEDO / 2
     np.testing.assert_allclose(color[inside], once * (once + once**2), rtol=0.06)
     np.testing.assert_allclose(color[inside].mean(), once * (once + once**2), rtol=0.02)
+
+
+def test_a_white_world_is_that_of_the_harmonic_system_and_nearly_invisible():
+    """White surfaces under constant light: what two bounces leave of radiance one is little."""
+    ball = builtin.sphere(rings=8, sectors=10)
+    mesh = join([ball, ground_plane(ball, vertices=64)])
+    white = separable.factor(Lambert(1.0), terms=1, resolution=4)
+    tensor = bounces.precompute(mesh, [white] * 2, edge=4, components=136, modes=96, size=8)
+    ones = Environment(jnp.ones((6, 8, 8, 1)))
+    facing = np.asarray(mesh.normal)[:, 1] > 0.1
+    reflected = radiance(of_regions(mesh, [Lambert(1.0)] * 2, tensor), ones, jnp.array([0.0, 50.0, 0.0]))
+    plain = harmonic.precompute_diffuse(mesh, degree=0, size=8)
+    albedo = np.ones((2, 1), np.float32)
+    exact = harmonic.interreflect_diffuse(mesh, plain, albedo, bounces=2, size=8)
+    first, exact = (np.asarray(each.vector)[0, 0, facing] * np.sqrt(4 * np.pi) for each in (plain, exact))
+    both = first + np.asarray(reflected)[facing, 0]
+    assert (1 - first).max() > 0.4
+    assert np.linalg.norm(both - exact) < 0.004 * np.linalg.norm(exact)
+    assert (1 - both).min() > -0.02  # Harmonics of the first bounce ring.
+    assert np.mean(1 - both) < 0.4 * np.mean(1 - first)
 
 
 def test_what_bounces_bring_is_estimated_as_the_closed_form_has_it():
@@ -210,10 +220,16 @@ def test_what_does_not_fit_is_refused():
     system = made(mesh, [Lambert(1.0)] * 2, terms=1).bounces
     with pytest.raises(ValueError, match=r"BRDF must have degree 3, that of reflected light, got 2"):
         ReflectingPart(mesh.position, system.group[0].frame, harmonic.tabulate(Lambert(1.0), degree=2))
-    with pytest.raises(ValueError, match=r"one factored BRDF for each of 1 regions, got 2 BRDFs, 0 of them sets"):
+    with pytest.raises(ValueError, match="must have a BRDF for each of 1 regions, got 2"):
         GroupBounces.make(system.tensor, system.group[:1], [np.arange(count)])
     shorter = ReflectingPart(mesh.position[:3], system.group[0].frame[:3], system.group[0].brdf)
     with pytest.raises(ValueError, match=rf"must have the tensor's {count} vertices, got 3"):
         GroupBounces.make(system.tensor, (system.group[0], shorter), [np.arange(count), count + np.arange(count)])
+    with pytest.raises(TypeError, match=r"must be of class Environment, .* got one of class int"):
+        system.light(3)
+    with pytest.raises(ValueError, match="must be one environment"):
+        system.light(Environment(SKY.radiance[None]))
+    with pytest.raises(ValueError, match="the light's faces, 9, got 2"):
+        system.light(Environment(jnp.ones((6, 9, 9, 3))))
     with pytest.raises(ValueError, match=rf"must have weights \[{count} vertices, 1 channels, c\]"):
         system.shade(system.light(SKY), [prt.Blend(jnp.ones((count, 2, 3))), None])

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import jaxprt as prt
-from jaxprt import bounces, harmonic, separable
+from jaxprt import bounces, separable
 from jaxprt.brdf import Lambert
 from jaxprt.scene import Environment, Mesh, builtin
 from jaxprt.scene.mesh import join, make_mesh
-from jaxprt.sphere import directions
-from jaxprt.systems.bounces import GroupBounces, ReflectingPart
+from jaxprt.systems.bounces import GroupBounces
+from tests.systems.bounces.reflected import of_regions, radiance
 
 pytestmark = pytest.mark.usefixtures("coarse")
 
@@ -36,24 +36,11 @@ def made(mesh: Mesh, albedo: float = 1.0, **options) -> GroupBounces:
     regions = np.unique(np.asarray(mesh.region)).tolist()
     matte = separable.factor(Lambert(albedo), terms=1, resolution=8)
     tensor = bounces.precompute(mesh, [matte] * len(regions), **OPTIONS | options)
-    table, frame = harmonic.tabulate(Lambert(albedo), degree=3), directions.frame(mesh.normal, mesh.tangent)
-    own = [np.asarray(mesh.region) == number for number in regions]
-    groups = [ReflectingPart(mesh.position[at], frame[at], table) for at in own]
-    return GroupBounces.make(tensor, groups, [np.flatnonzero(at) for at in own])
-
-
-def radiance(system: GroupBounces, light: Environment = SKY, materials=None) -> jax.Array:
-    """Reflected radiance of all vertices, region after region."""
-    blends = [None] * len(system.group) if materials is None else materials
-    arriving = system.shade(system.light(light), blends)
-    rows = zip(system.group, arriving, blends, strict=True)
-    colors = [part.combine(lit, part.view(EYE, blend)) for part, lit, blend in rows]
-    most = max(each.shape[1] for each in colors)
-    return jnp.concatenate([jnp.broadcast_to(each, (len(each), most)) for each in colors])
+    return of_regions(mesh, [Lambert(albedo)] * len(regions), tensor)
 
 
 def shown(system: GroupBounces, materials=None) -> np.ndarray:
-    return np.asarray(radiance(system, materials=materials))
+    return np.asarray(radiance(system, SKY, EYE, materials))
 
 
 @functools.cache
@@ -81,7 +68,7 @@ def test_every_bounce_adds_half_of_the_one_before_and_is_worth_it():
     assert rest.shape == (3,)
     np.testing.assert_allclose(rest[2], 0.125, rtol=0.03)
     white = jnp.ones((len(tensor.function), 1))
-    lit = bounces.light_side(tensor, SKY)
+    lit = bounces.relight.light_side(tensor, SKY)
 
     def arriving(count):
         patches = tensor.patches
@@ -150,7 +137,7 @@ def test_gradients_of_all_bounces_are_finite_differences():
     def total(step, light_step):
         blend = prt.Blend(texture * (1 + step * jnp.arange(count)[:, None, None] / count))
         light = Environment(SKY.radiance.at[2].multiply(1 + light_step))
-        return jnp.mean(radiance(system, light, [blend]))
+        return jnp.mean(radiance(system, light, EYE, [blend]))
 
     slope = jax.grad(total, (0, 1))(0.0, 0.0)
     for number, each in enumerate(slope):
@@ -165,7 +152,7 @@ def test_a_closed_white_room_without_light_stays_dark():
     np.testing.assert_allclose(system.tensor.worth, 0, atol=1e-6)
     np.testing.assert_allclose(shown(system), 0, atol=1e-6)
     np.testing.assert_allclose(np.sum(system.tensor.patches.between, 1), 1, atol=2e-3)
-    slope = jax.grad(lambda x: jnp.sum(radiance(system, Environment(x))))(SKY.radiance)
+    slope = jax.grad(lambda x: jnp.sum(radiance(system, Environment(x), EYE)))(SKY.radiance)
     assert np.isfinite(slope).all()
 
 

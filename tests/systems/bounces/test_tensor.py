@@ -53,8 +53,9 @@ def light(seed, edge=EDGE):
 
 def arriving(tensor, environment, weight=None):
     """SH coefficients of one bounce and of two, [v s c]."""
-    lit = bounces.light_side(tensor, environment)
-    weight = bounces.relight.weights(tensor, [None] * len(tensor.factor)) if weight is None else weight
+    lit = bounces.relight.light_side(tensor, environment)
+    if weight is None:
+        weight = jnp.concatenate([jnp.broadcast_to(each, (len(each), 3)) for each in tensor.factor])[tensor.function]
     both, one = (np.asarray(bounces.relight.collect(tensor, x, weight)) for x in (lit, LitTransfer(lit.first, None)))
     return one.transpose(2, 0, 1), (both - one).transpose(2, 0, 1)
 
@@ -219,9 +220,9 @@ def test_fewer_components_and_modes_err_as_they_say(mesh, brdfs, whole):
 
 @pytest.fixture(scope="module")
 def changing():
-    """A set of BRDFs."""
+    """Functions of several BRDFs, and a diffuse one."""
     members = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in (0.4, 0.6)]
-    return bounces.factor(members, functions=2, terms=6, resolution=12)
+    return bounces.functions.shared(members, functions=2, terms=6, resolution=12)[0]
 
 
 def test_what_brings_little_is_left_out_and_told(mesh, changing, capsys):
@@ -308,8 +309,8 @@ def test_what_makes_no_tensor_is_refused(mesh, brdfs):
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_weights_of_other_regions_and_channels_are_refused(mesh, brdfs, changing):
-    def refused(weights, message, brdfs=brdfs):
+def test_weights_of_other_regions_and_channels_are_refused(mesh, brdfs):
+    def refused(weights, message):
         with pytest.raises(ValueError, match=message):
             bounces.precompute(mesh, brdfs, weights=weights)
 
@@ -317,8 +318,3 @@ def test_weights_of_other_regions_and_channels_are_refused(mesh, brdfs, changing
     refused([None, jnp.ones((2, 3))], r"the weights of region 1 must be \[3 channels, c\], got \[2, 3\]")
     refused([jnp.ones(3), None], r"the weights of region 0 must be \[3 channels, c\], got \[3\]")
     refused([jnp.full((3, 1), jnp.nan), None], r"the weights of region 0 must be finite, got 3 of 3")
-    refused(
-        [jnp.ones((1, 1)), None],
-        "region 0 must be None because it has a set of BRDFs, got an array",
-        [changing, brdfs[1]],
-    )

@@ -1,5 +1,6 @@
 """BRDFs over their parameters as lobes, a diffuse part and a tensor: what it holds, and between knots."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from jaxprt import dynamic, lobe
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.brdf.varying import Channels
+from jaxprt.sphere import hemisphere
 from jaxprt.systems.protocol import Blend
 
 ROUGH = np.log(np.array([0.3, 0.42, 0.6], np.float32))
@@ -55,6 +57,45 @@ def test_the_values_at_the_knots_are_those_of_the_brdf(whole):
 def test_more_ranks_leave_less(whole):
     errors = [float(tabulate(lobes=0, ranks=ranks).error) for ranks in ((1, 2, 2), (2, 8, 8))]
     assert errors[0] > errors[1] > float(whole.error)
+
+
+@pytest.mark.parametrize("ranks", [(1, 4, 4), (2, 8, 8), (3, 24, 24)])
+def test_the_error_of_a_tensor_is_that_of_what_it_reflects(ranks):
+    """Under a few harmonics, by a quadrature of its own. The BRDFs of the set are the channels."""
+    brdf = Channels(tuple(CookTorrance(0.0, 1.0, m, 0.3) for m in (0.25, 0.4, 0.6)), jnp.ones(3))
+    table, height = dynamic.tabulate(brdf, lobes=0, ranks=ranks, resolution=16), np.array([0.35, 0.6, 0.9])
+    exact, found = reflected(
+        brdf, table, jnp.asarray(np.stack([np.sqrt(1 - height**2), 0 * height, height], 1), jnp.float32)
+    )
+    assert off(found, exact) < 0.65 * float(table.error)
+
+
+@jax.jit
+def reflected(brdf, table, view):
+    """What a BRDF and its table send to views, of light of a few harmonics."""
+
+    def one(wo):
+        wi, area = hemisphere.arcs(wo * jnp.array([-1, -1, 1]), rings=32, sectors=48)
+        basis = jnp.concatenate([jnp.ones_like(wi[:, :1]), wi, wi[:, :1] * wi[:, 2:]], 1) * (wi[:, 2:] * area[:, None])
+        wo = jnp.broadcast_to(wo, wi.shape)
+        return basis.T @ brdf(wi, wo), basis.T @ table(wi, wo)
+
+    return jax.lax.map(one, view)
+
+
+def test_turned_views_equal_views_one_by_one(monkeypatch):
+    members = [family(place) for place in ROUGH]
+    fast = dynamic.reflected.reflect(members, None, resolution=6)
+    monkeypatch.setattr(dynamic.reflected, "is_isotropic", lambda brdf: False)
+    slow = dynamic.reflected.reflect(members, None, resolution=6)
+    np.testing.assert_allclose(fast.whole, slow.whole, rtol=1e-4)
+    assert off(fast.tensor, slow.tensor) < 1e-4
+
+
+def test_brdfs_that_are_negative_are_refused_by_their_number():
+    members = [Lambert(0.5), lambda wi, wo: -wi[:, 2:]]
+    with pytest.raises(ValueError, match="1 of 2 BRDFs that are not, the first is number 1"):
+        dynamic.reflected.reflect(members, None, resolution=8)
 
 
 def test_the_diffuse_channel_needs_no_tensor(whole):
