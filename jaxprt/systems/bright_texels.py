@@ -165,6 +165,11 @@ class BrightTexels(VertexSystem):
         return self.system.lobe_table
 
     @property
+    def lobe_part(self) -> Any:
+        """The lobes of the underlying system, which can be widened."""
+        return self.system.lobe_part
+
+    @property
     def degree(self) -> int | None:
         """The degree of the underlying system."""
         return self.system.degree

@@ -126,6 +126,14 @@ class System(eqx.Module):
         return None
 
     @property
+    def lobe_part(self) -> Any:
+        """The `jaxprt.lobe.LobeSystem` whose lobes `view` widens by a variance; None if it has none.
+
+        `view` then takes the variance as a third argument.
+        """
+        return None
+
+    @property
     def degree(self) -> int | None:
         """Degree of the harmonics of the view beyond which radiance has nothing; None if there is no limit."""
         return None

@@ -13,7 +13,6 @@ from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future,
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax
 import numpy as np
 import tqdm
 from threadpoolctl import threadpool_limits
@@ -21,7 +20,6 @@ from threadpoolctl import threadpool_limits
 from jaxprt import require
 from jaxprt.files import arrays
 from jaxprt.files.arrays import BlockStore, Layout
-from jaxprt.scene.mesh import Mesh
 
 _HELD = 1 << 28  # bytes of results, and of copies of a job, that may be in flight at once
 _MOST = 4096  # blocks that may be in flight at once
@@ -235,16 +233,6 @@ def fingerprint(*array: Any) -> str:
         value = np.ascontiguousarray(np.asarray(value))
         digest.update(f"{value.shape}{value.dtype}".encode() + value.tobytes())
     return digest.hexdigest()
-
-
-def scene_key(mesh: Mesh) -> str:
-    """Fingerprint of a mesh: its positions, normals, faces and regions. Results of the same mesh have the same key.
-
-    Tangents do not count, and neither do the element types of the arrays. The opacity counts where there is one.
-    """
-    single = [np.asarray(vector, np.float32) for vector in (mesh.position, mesh.normal)]
-    whole = [np.asarray(index, np.int32) for index in (mesh.face, mesh.region)]
-    return fingerprint(*single, *whole, *jax.tree.leaves(mesh.opacity))
 
 
 def _run(job, todo, keep, store, executor, bar) -> None:

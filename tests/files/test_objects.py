@@ -120,7 +120,7 @@ def test_every_class_of_the_package_is_the_same_after_saving_and_after_pickling(
     monkeypatch.setattr(objects, "_run_checks", lambda value: None)  # which relate the values of fields
     random = np.random.default_rng(0)
     every = {f"{kind.__module__}.{kind.__name__}": filled(kind, random) for kind in classes()}
-    for name in ("SeparableBrdf", "BrdfSet", "TransferTensor", "RegionTransport", "Plan", "Environment", "Camera"):
+    for name in ("SeparableBrdf", "DynamicBrdf", "TransferTensor", "DynamicTransport", "Plan", "Environment", "Camera"):
         assert [key for key in every if key.endswith(f".{name}")], name
     prt.files.save(tmp_path / "all.prt", every)
     again = prt.files.load(tmp_path / "all.prt")

@@ -561,18 +561,6 @@ def test_the_view_maps_and_the_error_of_the_brdf_do_not_matter_to_the_store(sphe
     )
 
 
-def test_the_key_of_a_scene_tells_surfaces_and_regions_apart_and_no_tangents_or_types():
-    mesh = prt.scene.builtin.plane(cells=1)
-    key = visibility.blocks.scene_key(mesh)
-    for name in ("position", "normal", "face", "region", "tangent"):
-        moved = eqx.tree_at(lambda m, name=name: getattr(m, name), mesh, replace_fn=lambda x: x.at[0].add(1))
-        assert (visibility.blocks.scene_key(moved) == key) == (name == "tangent")
-    assert (
-        visibility.blocks.scene_key(eqx.tree_at(lambda m: m.position, mesh, np.asarray(mesh.position, np.float64)))
-        == key
-    )
-
-
 def test_fingerprints_tell_values_shapes_and_types_apart():
     array = np.arange(6, dtype=np.float32)
     different = [array, array.reshape(2, 3), array.astype(np.float64), array + 1, array[:5], array[::-1]]

@@ -116,7 +116,7 @@ def precompute(
         _tell(contribution, function, worth, second, bounces)
     rows = (members.places(member), job.region.astype(np.int32), areas(mesh).astype(whole.dtype))
     arrays = [jax.device_put(column) for column in (whole, core, found["mode"], *rows, function)]
-    made_of = {"factor": factor, "second": second, "mesh": visibility.blocks.scene_key(mesh), "patches": made}
+    made_of = {"factor": factor, "second": second, "patches": made}
     made_of |= {"lamp": None if lamp is None else jax.device_put(lamp[1]), "error": jnp.asarray(found["error"])}
     return TransferTensor(*arrays, **made_of, worth=jnp.asarray(worth, arrays[0].dtype))
 

@@ -237,7 +237,7 @@ class GroupBounces(eqx.Module):
 
     @promoted
     def light(self, environment: Environment) -> LitTransfer:
-        """Applies the tensor to a light, before materials are known: `jaxprt.bounces.light_side`."""
+        """Applies the tensor to a light, before materials are known."""
         return light_side(self.tensor, environment)
 
     @promoted

@@ -64,7 +64,6 @@ class TransferTensor(eqx.Module):
         worth: Contribution of each bounce under uniform light: RMS irradiance relative to the irradiance of an
             unoccluded surface. With "all" bounces, the last value
             is that of all bounces after the second together.
-        mesh: Fingerprint of the mesh. Transport of another mesh is refused. Empty if the tensor was made by hand.
         patches: Patches that exchange diffuse light, for textures and for bounces after the second; None without.
         lamp: For each cluster: lamps of radiance 1, components, harmonics and functions; None without lamps.
     """
@@ -80,7 +79,6 @@ class TransferTensor(eqx.Module):
     second: SecondBounce | None
     error: Float[Array, " g"]
     worth: Float[Array, " _"]
-    mesh: str = eqx.field(static=True, default="")
     patches: Patches | None = None
     lamp: Float16[Array, "g i n s q"] | None = None
 

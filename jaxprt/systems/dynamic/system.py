@@ -79,7 +79,7 @@ class DynamicSystem(protocol.VertexSystem):
     def light(self, environment: Environment) -> DynamicLight:
         """The light's wavelet coefficients, and the light blurred by lobes of about a dozen widths."""
         environment = protocol.one_light(environment, size=self.transport.size)
-        return DynamicLight(project(environment), self.lobes.light(environment))
+        return DynamicLight(project(environment), self.lobe_part.light(environment))
 
     @jit
     def shade(self, light: DynamicLight, materials: Blend | None = None) -> DynamicLight:
@@ -96,14 +96,22 @@ class DynamicSystem(protocol.VertexSystem):
         flux = diffuse.flux(blurred.coefficient, pyramid.vector, normal, size=pyramid.size)
         return dataclasses.replace(light, blurred=dataclasses.replace(blurred, flux=_turned(flux, blurred, normal)))
 
-    def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> DynamicView:
-        """View factors of the terms, and texels at which each vertex reads the blurred light for its lobes."""
+    def view(
+        self,
+        eye: Float[Array, "*p 3"],
+        materials: Blend | None = None,
+        variance: Float[Array, " v"] | None = None,
+    ) -> DynamicView:
+        """View factors of the terms, and texels at which each vertex reads the blurred light for its lobes.
+
+        `variance`, in squared radians, widens the lobes of each vertex or point. It does not change the terms.
+        """
         protocol.check_blend(materials)
         eye = require.position("the eye", eye, points=self.vertices)
         if materials is not None:
             materials.check(self.vertices, self.brdf.channels)
         wo = _direction(self.transport.position, self.transport.frame, self.points, eye)
-        return DynamicView(self.brdf.view(wo, materials), self.lobes.view(eye, materials))
+        return DynamicView(self.brdf.view(wo, materials), self.lobe_part.view(eye, materials, variance))
 
     def combine(self, light: DynamicLight, view: DynamicView) -> Float[Array, "v c"]:
         """Radiance: terms, lobes and the diffuse part."""
@@ -111,19 +119,19 @@ class DynamicSystem(protocol.VertexSystem):
         require.kind("the view", view, DynamicView, source="DynamicSystem.view")
         light = self.shade(light) if light.arriving is None else light
         assert light.arriving is not None
-        result = self.lobes.combine(light.blurred, view.lobes)
+        result = self.lobe_part.combine(light.blurred, view.lobes)
         if not self.brdf.terms:
             return result
         return result + combine(self.carried(light.arriving), view.factor)
 
     @property
-    def lobes(self) -> LobeSystem:
+    def lobe_part(self) -> LobeSystem:
         """The lobes and the diffuse part alone, without the tensor: what exported pages show."""
         return LobeSystem(self.transport.pyramid, self.brdf.lobe, points=self.points)
 
     def exported(self, what: str) -> protocol.Exported:
         """That of the lobes, without the tensor."""
-        return self.lobes.exported(what)
+        return self.lobe_part.exported(what)
 
     @property
     def vertices(self) -> int:

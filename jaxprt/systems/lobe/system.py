@@ -143,6 +143,11 @@ class LobeSystem(protocol.VertexSystem):
         return self.brdf
 
     @property
+    def lobe_part(self) -> "LobeSystem":
+        """The system itself."""
+        return self
+
+    @property
     def vertices(self) -> int:
         """Number of vertices, or of points where radiance is evaluated at points."""
         return len(self.transport.position if self.points is None else self.points)

@@ -1,4 +1,4 @@
-"""The lobe system with lobes that are widened at each point: what a reflection ray sees, which stands for a cone.
+"""Systems with lobes that are widened at each point: what a reflection ray sees, which stands for a cone.
 
 A ray of the reflection of a glossy surface stands for a cone of directions, which meets an area of the surface that it
 hits and leaves it with a wider spread still. If that surface is read at one direction, a highlight that a few rays hit
@@ -6,24 +6,22 @@ makes bright dots. Widened lobes read the mean over the cone: a von Mises-Fisher
 directions of variance s, is nearly one of concentration 1 / (1 / k + s).
 """
 
-from typing import Any, TypeGuard
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jaxprt.compile import jit, total
 from jaxprt.sphere import cubemap, directions
 from jaxprt.systems.bright_texels import BrightLight, BrightTexels
-from jaxprt.systems.lobe.blurred_light import LobeLight
-from jaxprt.systems.lobe.system import LobeSystem, LobeView
 from jaxprt.systems.lobe.table import Lobes
-from jaxprt.systems.protocol import Blend
+from jaxprt.systems.protocol import Blend, System
 from jaxprt.visibility import LEVELS
 
 
 class WidenedView(eqx.Module):
-    """A view of a lobe system with widened lobes.
+    """A view of a system with widened lobes.
 
     Attributes:
         rest: The view of the light without its brightest texels.
@@ -31,21 +29,19 @@ class WidenedView(eqx.Module):
         frame: Shading frames of the vertices or points; rows are tangent, bitangent, normal.
     """
 
-    rest: LobeView
+    rest: PyTree
     lobe: Lobes
     frame: Float[Array, "v 3 3"]
 
 
-def can_widen(system: Any) -> TypeGuard[LobeSystem | BrightTexels]:
-    """Whether a system represents its BRDF by lobes."""
-    return isinstance(system.system if isinstance(system, BrightTexels) else system, LobeSystem)
+def can_widen(system: System) -> bool:
+    """Whether a system represents its BRDF by lobes, possibly besides other terms."""
+    return system.lobe_part is not None
 
 
 @jit
-def view(
-    system: LobeSystem | BrightTexels, eye: Float[Array, "*p 3"], blend: Blend | None, variance: Float[Array, " v"]
-) -> WidenedView:
-    """The view of a lobe system, with or without bright texels, whose lobes are widened.
+def view(system: Any, eye: Float[Array, "*p 3"], blend: Blend | None, variance: Float[Array, " v"]) -> WidenedView:
+    """The view of a system with lobes, with or without bright texels, whose lobes are widened.
 
     Args:
         system: The system, at vertices or points.
@@ -53,19 +49,17 @@ def view(
         blend: Weights and parameters of the channels; None for the BRDF as it is.
         variance: Variance in squared radians, along one axis, by which all lobes of a vertex or point are widened.
     """
-    inner = system.system if isinstance(system, BrightTexels) else system
-    assert isinstance(inner, LobeSystem)
-    position, frame = inner.place(inner.transport)
-    lobe = inner.brdf.lookup(directions.view(frame, position, eye), *(() if blend is None else blend.parameter))
+    inner, lobes = system.system if isinstance(system, BrightTexels) else system, system.lobe_part
+    position, frame = lobes.place(lobes.transport)
+    lobe = lobes.brdf.lookup(directions.view(frame, position, eye), *(() if blend is None else blend.parameter))
     rest = inner.view(eye, blend, variance)
-    lobe = Lobes(lobe.mean, lobe.concentration, rest.weight, rest.diffuse).widened(variance)
+    looked = rest if inner is lobes else rest.lobes
+    lobe = Lobes(lobe.mean, lobe.concentration, looked.weight, looked.diffuse).widened(variance)
     return WidenedView(rest, lobe, frame)
 
 
 @jit
-def combine(
-    system: LobeSystem | BrightTexels, light: LobeLight | BrightLight, seen: WidenedView
-) -> Float[Array, "v c"]:
+def combine(system: Any, light: PyTree, seen: WidenedView) -> Float[Array, "v c"]:
     """Radiance: the blurred light, read by the widened lobes, and the brightest texels, each times the same lobes.
 
     Args:
@@ -74,7 +68,6 @@ def combine(
         seen: The result of `view`.
     """
     if not isinstance(light, BrightLight):
-        assert isinstance(system, LobeSystem)
         return system.combine(light, seen.rest)
     assert isinstance(system, BrightTexels)
     assert light.seen is not None

@@ -11,6 +11,7 @@ from jaxprt import bright_texels, dynamic, visibility
 from jaxprt.brdf import MetallicRoughness
 from jaxprt.scene import Environment, builtin
 from jaxprt.scene.points import Points
+from jaxprt.systems.lobe import widened
 from jaxprt.systems.protocol import Blend
 from jaxprt.systems.standard import METALLIC_ROUGHNESS
 
@@ -113,6 +114,24 @@ def test_points_with_a_tilted_normal_reflect_around_it(seen, system):
     same = made.at(straight)
     found = same.combine(tilted, same.view(EYE, blend))
     np.testing.assert_allclose(found, made.combine(lit, made.view(EYE, blend)), rtol=2e-3, atol=2e-3)
+
+
+def test_rays_read_its_lobes_widened_and_its_terms_as_they_are(seen, light, system):
+    name, made = system
+    blend = materials(len(seen.position), 0.3)
+    whole = bright_texels.BrightTexels(made, made.transport.pyramid, METALLIC_ROUGHNESS.family, count=8)
+    sun = Environment(jnp.zeros((6, SIZE, SIZE, 3)).at[2, 8, 8].set(100.0))
+
+    def read(of, environment, variance):
+        lit = of.shade(of.light(environment))
+        view = widened.view(of, EYE, blend, jnp.full(len(seen.position), variance))
+        return np.asarray(widened.combine(of, lit, view))
+
+    assert widened.can_widen(whole)
+    plain = prt.radiance(made, light, eye=EYE, materials=blend)
+    np.testing.assert_allclose(read(made, light, 0.0), plain, rtol=1e-4, atol=1e-4)
+    if name != "with a tensor alone":
+        assert read(whole, sun, 0.3).max() < 0.6 * read(whole, sun, 0.0).max()
 
 
 def test_transport_of_another_brdf_is_refused(seen):
