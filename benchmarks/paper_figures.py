@@ -42,7 +42,8 @@ def picture(
 def models(made: Made, changed: Look | None = None) -> list[Any]:
     """BRDFs of all regions, for Mitsuba; `changed` is that of `Made.materials`."""
     free = made.materials(changed)
-    return [free.get(part.name) or Lambert(part.material.base_color) for part in made.scene.scene.parts]
+    names = [part.name for part in made.scene.scene.parts]
+    return [free.get(name) or Lambert(made.recipe.fixed[int(name)]) for name in names]
 
 
 def traced(

@@ -49,7 +49,8 @@ def view(system: Any, eye: Float[Array, "*p 3"], blend: Blend | None, variance: 
         blend: Weights and parameters of the channels; None for the BRDF as it is.
         variance: Variance in squared radians, along one axis, by which all lobes of a vertex or point are widened.
     """
-    inner, lobes = system.system if isinstance(system, BrightTexels) else system, system.lobe_part
+    lobes = system.lobe_part
+    inner: Any = system.system if isinstance(system, BrightTexels) else system
     position, frame = lobes.place(lobes.transport)
     lobe = lobes.brdf.lookup(directions.view(frame, position, eye), *(() if blend is None else blend.parameter))
     rest = inner.view(eye, blend, variance)
