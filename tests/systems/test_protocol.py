@@ -196,7 +196,7 @@ SYSTEMS = {
     "lobe and matte": Promise(total, None, None),
 }
 each_system = pytest.mark.parametrize("name", SYSTEMS)
-LOOPS = ["separable", "dynamic", "bounces"]  # They have all loops among them.
+LOOPS = ["separable", "dynamic", "scene with bounces"]  # They have all loops among them.
 
 
 @functools.cache
