@@ -153,7 +153,7 @@ def matte(albedo: Any) -> TexturedMaterial:
 def with_transfer(scene: prt.RelitScene, path: pathlib.Path | None = None, **options: Any) -> prt.RelitScene:
     """The scene with reflected light that is precomputed with other options, and a region for each part."""
     assert scene.bounces is not None
-    lights = [paths.factored(scene.shading[parts[0]]) for parts in scene.place.parts]
+    lights = [paths.factor(scene.shading[parts[0]]) for parts in scene.place.parts]
     weights = [paths.typical(part, lights[n]) for part, n in zip(scene.shading, scene.place.group, strict=True)]
     brdfs, mesh = [lights[number].brdf for number in scene.place.group], joined_mesh(scene.shading)
     tensor = bounces.precompute(mesh, brdfs, weights=weights, run=prt.Run(path, progress=False), **options)

@@ -43,11 +43,11 @@ def unreal(value: Any) -> str:
         return f"the text {value[:40]!r}"
     known = _array_of(value)
     if known is None:
-        return f"{_described(value)}, which is not an array of numbers"
+        return f"{_describe(value)}, which is not an array of numbers"
     if jnp.issubdtype(known.dtype, jnp.integer) or jnp.issubdtype(known.dtype, jnp.floating):
         return ""
     if known.dtype == object:
-        return "an integer of more than 64 bits" if isinstance(value, int) else _described(value)
+        return "an integer of more than 64 bits" if isinstance(value, int) else _describe(value)
     names = {"b": "booleans", "c": "complex numbers", "U": "text", "S": "text"}
     return names.get(getattr(known.dtype, "kind", ""), f"values of type {known.dtype}")
 
@@ -183,7 +183,7 @@ def rotation(name: str, value: Any) -> Array:
             matrix = np.asarray(known, np.float64)
             fits = np.allclose(matrix @ matrix.T, np.eye(3), rtol=0, atol=_ORTHOGONAL) and np.linalg.det(matrix) > 0
     if not fits:
-        got = known.tolist() if np.ndim(known) < 3 and not isinstance(known, Tracer) else _described(known)
+        got = known.tolist() if np.ndim(known) < 3 and not isinstance(known, Tracer) else _describe(known)
         raise ValueError(f"{name} must be a 3 x 3 rotation matrix, got {got}")
     return floating(value)
 
@@ -192,7 +192,7 @@ def number(name: str, value: Any, low: float, *, high: float = LARGEST, above: b
     """Refuses anything but one real number (TypeError) within a range (ValueError); with `above`, not its lower end."""
     real(name, value)
     if np.ndim(_array_of(value)):
-        raise TypeError(f"{name} must be one number, got {_described(value)}")
+        raise TypeError(f"{name} must be one number, got {_describe(value)}")
     if isinstance(value, Tracer):
         return
     if not np.isfinite(_array_of(value)):
@@ -264,7 +264,7 @@ def between(name: str, value: int | None, low: int, high: int) -> None:
         return
     real(name, value)
     if np.ndim(_array_of(value)):
-        raise TypeError(f"{name} must be one number, got {_described(value)}")
+        raise TypeError(f"{name} must be one number, got {_describe(value)}")
     if not low <= value <= high:
         raise ValueError(f"{name} must be between {low} and {high}, got {value}")
 
@@ -372,7 +372,7 @@ def kind(name: str, value: Any, *wanted: type, source: str) -> None:
     """
     if not isinstance(value, wanted):
         names = " or ".join(kind.__name__ for kind in wanted)
-        raise TypeError(f"{name} must be of class {names}, which {source} makes, got {_described(value)}")
+        raise TypeError(f"{name} must be of class {names}, which {source} makes, got {_describe(value)}")
 
 
 def array(name: str, value: Any, *axes: str, source: str = "") -> None:
@@ -393,7 +393,7 @@ def array(name: str, value: Any, *axes: str, source: str = "") -> None:
         return
     required = " or ".join(f"[{', '.join(axis.split())}]" for axis in axes)
     advice = f", which {source} makes" if source else ""
-    message = f"{name} must be an array {required}{advice}, got {_described(value)}"
+    message = f"{name} must be an array {required}{advice}, got {_describe(value)}"
     raise TypeError(message) if shape is None else ValueError(message)
 
 
@@ -413,7 +413,7 @@ def arguments(**check: Callable[[Any], Any]) -> Callable[[Function], Function]:
         signature = inspect.signature(function)
 
         @functools.wraps(function)
-        def checked(*argument, **named):
+        def call(*argument, **named):
             bound = signature.bind_partial(*argument, **named)
             for name, door in check.items():
                 if name in bound.arguments:
@@ -422,7 +422,7 @@ def arguments(**check: Callable[[Any], Any]) -> Callable[[Function], Function]:
                         bound.arguments[name] = converted
             return function(*bound.args, **bound.kwargs)
 
-        return cast(Function, checked)
+        return cast(Function, call)
 
     return decorate
 
@@ -434,7 +434,7 @@ def _fits(shape: tuple[int, ...], axes: list[str]) -> bool:
     )
 
 
-def _described(value: Any) -> str:
+def _describe(value: Any) -> str:
     if isinstance(value, jax.Array | np.ndarray):
         return f"an array of shape {list(value.shape)}"
     return f"one of class {type(value).__name__}"
@@ -443,6 +443,6 @@ def _described(value: Any) -> str:
 def shown(value: Any) -> str:
     """A value in at most 40 letters, and its class."""
     if isinstance(value, jax.Array | np.ndarray):
-        return _described(value)
+        return _describe(value)
     text = repr(value)
     return f"{text if len(text) <= 40 else text[:37] + '...'} of class {type(value).__name__}"

@@ -108,7 +108,7 @@ HOST = {
     "systems.lobe.pyramid.bits": "cuts bytes",
     "systems.lobe.pyramid.dither": "bits, in NumPy",
     "systems.lamps.places": "chooses places on the host",
-    "systems.bright_texels.sent": "takes indices, frames and shares; bright_texels.radiance has them all",
+    "systems.bright_texels.texel_radiance": "takes indices, frames and shares; bright_texels.radiance has them all",
     "systems.lobe.diffuse.flux": "takes unit normals; tests/systems/lobe/test_diffuse.py",
     "systems.lobe.diffuse.at_points": "takes points; tests/systems/lobe/test_diffuse.py",
     "systems.lobe.pyramid.texel_bits": "the same",

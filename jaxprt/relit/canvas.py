@@ -97,7 +97,7 @@ def _texels_behind(
     return jnp.broadcast_to(picture, (*picture.shape[:2], colors))
 
 
-def drawn(
+def draw(
     picture: Float[Array, "h w c"], pixels: Pixels, index: Int[Array | np.ndarray, "*m"], color: Float[Array, "*m d"]
 ) -> Float[Array, "h w c"]:
     """The picture with the colors of some points added, each to its pixel. The picture before is used up.

@@ -117,7 +117,7 @@ def blend(look: MaterialLook, term: tuple[int, ...], scale: Float[Array | np.nda
     """
     weight, columns = look.coefficient[:, np.asarray(term)] / scale[:, None], look.coefficient.shape[1]
     if rest := [column for column in range(len(_NAMES), columns) if column not in term]:
-        # A layer that was not precomputed: `replaced` refuses it where it is known.
+        # A layer that was not precomputed: `_replace_material` refuses it where it is known.
         xp = np if known(look) else jnp
         weight = xp.where(xp.any(look.coefficient[:, np.asarray(rest)] != 0, (1, 2))[:, None, None], xp.nan, weight)
     if len(term) > len(_NAMES):
@@ -344,7 +344,7 @@ def appearance(part: Part, shading: Shading, material: Changeable, *, look: Mate
             precomputed, or a term, a roughness or an anisotropy that the part's own tables lack.
         TypeError: The new material is of another model than the precomputed one.
     """
-    new = replaced(part, shading, material)
+    new = _replace_material(part, shading, material)
     look = _look(new) if look is None else look
     assert shading.scale is not None
     weights = blend(look, shading.term, shading.scale, varies=bool(shading.knot))
@@ -356,7 +356,7 @@ def appearance(part: Part, shading: Shading, material: Changeable, *, look: Mate
     return Appearance(Blend(weight, weights.parameter), emitted)
 
 
-def replaced(part: Part, shading: Shading, material: Changeable) -> Part:
+def _replace_material(part: Part, shading: Shading, material: Changeable) -> Part:
     """The part with a new material. Refuses materials that its system cannot have; `appearance` gives the errors."""
     model = TexturedMaterial if shading.table is None else _MODELS.get(shading.table, TexturedMaterial)
     for table, name in ((standard.COATED, "clearcoat"), (standard.SHEENED, "sheen_color")):

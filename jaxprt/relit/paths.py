@@ -44,7 +44,7 @@ class Path(NamedTuple):
     sent: FunctionWeights | None
 
 
-def factored(shading: Shading) -> Path:
+def factor(shading: Shading) -> Path:
     """The factored BRDF with which a part sends reflected light to other parts.
 
     Lobes too narrow for the resolution of the maps are widened: otherwise a smooth metal would send many
@@ -55,17 +55,17 @@ def factored(shading: Shading) -> Path:
     """
     if shading.table is not None:
         return _standard(shading.table)
-    return _factor(still(shading), shading.brdf, shading.knot if shading.blend is not None else ())
+    return _factor_family(still(shading), shading.brdf, shading.knot if shading.blend is not None else ())
 
 
 @functools.cache
 def _standard(table: StandardTable) -> Path:
     if table != standard.BLINN_PHONG:
         return Path(*table.paths())
-    return _factor(table.family, table.family, table.knots)
+    return _factor_family(table.family, table.family, table.knots)
 
 
-def _factor(alone: Callable, brdf: Callable, knot: tuple[np.ndarray, ...]) -> Path:
+def _factor_family(alone: Callable, brdf: Callable, knot: tuple[np.ndarray, ...]) -> Path:
     """The factored BRDF of a family over roughness, or of one BRDF; `alone` is it at one roughness."""
     knot = _finer(knot)
     members = [brdf(jnp.asarray(value)) for value in knot[0]] if knot else [alone]

@@ -109,7 +109,7 @@ class PictureView(eqx.Module):
             colors = max(colors, color.shape[-1])
         picture = canvas.sky(environment, self.camera, self.ray, self.pixels.background, colors=colors)
         for index, color in rows:
-            picture = canvas.drawn(picture, self.pixels, index, color)
+            picture = canvas.draw(picture, self.pixels, index, color)
         return picture if self.fold == 1 else _folded(picture, fold=self.fold)
 
 

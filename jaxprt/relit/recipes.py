@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,8 +19,6 @@ from jaxprt.systems.protocol import System
 from jaxprt.systems.separable import SeparableBrdf
 from jaxprt.systems.standard import StandardTable
 from jaxprt.visibility import Run, StoredVisibility
-
-T = TypeVar("T")
 
 _HARMONIC_SIZE = 32  # edge of the visibility's faces in texels: enough for low degrees
 _STEPS = 4  # number of intervals of a harmonic table for each interval of a lobe table
@@ -48,10 +46,10 @@ class Known:
 
     def factored(self, brdf: Callable, terms: int, resolution: int) -> SeparableBrdf:
         """The BRDF of the part, factored into terms. An earlier factorization is truncated if it has enough terms."""
-        brdf_terms = self._factored.get(resolution)
-        if brdf_terms is None or brdf_terms.terms < terms:
-            brdf_terms = self._factored[resolution] = separable.factor(brdf, terms=terms, resolution=resolution)
-        return brdf_terms.truncate(terms)
+        longest = self._factored.get(resolution)
+        if longest is None or longest.terms < terms:
+            longest = self._factored[resolution] = separable.factor(brdf, terms=terms, resolution=resolution)
+        return longest.truncate(terms)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,7 +97,7 @@ class Recipe(eqx.Module):
             shading: The parts as one mesh, with their BRDF.
             target: Occluders, and where and how to compute.
             vertices: Number of vertices of the result, of which those after the mesh's repeat the last one; None for
-                the mesh's. `jaxprt.relit.recipes.padded` pads transport.
+                the mesh's. `jaxprt.systems.axes.pad` pads transport.
         """
 
     def takes(self, table: StandardTable) -> bool:
@@ -122,11 +120,6 @@ class Recipe(eqx.Module):
         return (self,)
 
 
-def padded(transport: T, vertices: int | None) -> T:
-    """Transport padded to a number of vertices."""
-    return transport if vertices is None else axes.pad(transport, vertices)
-
-
 class Lobes(Recipe):
     """Recipe of the lobe system. The brightest texels of the light are summed exactly.
 
@@ -145,7 +138,7 @@ class Lobes(Recipe):
 
     def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
         """Precomputes the system of all vertices of the shading's mesh, padded to a number of vertices."""
-        transport = padded(_pyramid(shading.mesh, target), vertices)
+        transport = axes.pad(_pyramid(shading.mesh, target), vertices)
         if shading.matte:
             matte = lobe.MatteSystem(lobe.matte_transport(transport), shading.albedo)
             return _bright(matte, lobe.texel_bits(transport), shading, _MATTE_TEXELS * self.texels, transport.size)
@@ -188,7 +181,7 @@ class Harmonics(Recipe):
         store = f"{'vectors' if matte else 'matrices'}_{self.degree}"
         size, options = min(target.size, _HARMONIC_SIZE), target.traced(store)
         whole: Any = trace(shading.mesh, degree=self.degree, size=size, apart=True, **options)
-        transport = padded(whole, vertices)
+        transport = axes.pad(whole, vertices)
         if shading.matte:
             return harmonic.DiffuseSystem(transport, shading.albedo)
         return harmonic.HarmonicSystem(transport, harmonic_table(shading, degree=self.degree), self.laplacian)
@@ -348,7 +341,7 @@ class Dynamic(Recipe):
         sizes = {"components": self.components, "modes": self.modes, "keep": self.keep}
         name = "" if self.ranks is None else "_" + "_".join(map(str, (self.lobes, *self.ranks)))
         options = {**sizes, "run": target.run.within(f"dynamic{name}.prt")}
-        transport = padded(dynamic.compress(known.visible, brdf, pyramid=known.pyramid, **options), vertices)
+        transport = axes.pad(dynamic.compress(known.visible, brdf, pyramid=known.pyramid, **options), vertices)
         return _bright(dynamic.DynamicSystem(transport, brdf), transport.pyramid, shading, self.texels, target.size)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:

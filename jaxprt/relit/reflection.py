@@ -75,7 +75,7 @@ def make(
         The system of reflected light alone.
     """
     first = [shadings[members[0]] for members in place.parts]
-    of_group = [paths.factored(shading) for shading in first]
+    of_group = [paths.factor(shading) for shading in first]
     typical = [paths.typical(shading, of_group[group]) for shading, group in zip(shadings, place.group, strict=True)]
     region, members = _regions(place, typical)
     mesh = dataclasses.replace(

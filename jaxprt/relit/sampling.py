@@ -117,7 +117,7 @@ class Sample:
         visible = visibility.precompute(mesh, size=size, occluder=scene, vertex=vertex, run=quiet)
         seconds = time.perf_counter() - start
         few = max(FEWEST, round(POINTS * count / total))
-        points = _scattered(mesh, vertex, few)
+        points = _scatter(mesh, vertex, few)
         target = Target(scene, size=size, vertex=vertex, known=Known(visible), run=quiet)
         whole = Points(jnp.asarray(vertex)[points.corner], points.weight)
         blend, brdf = channels.materials_at(parts, shading, whole)
@@ -168,7 +168,7 @@ class Sample:
         return once * (self.vertex_ratio if system.shared_light is None else 1) + self.vertex_ratio * rest
 
 
-def _scattered(mesh: Mesh, vertex: np.ndarray, count: int) -> Points:
+def _scatter(mesh: Mesh, vertex: np.ndarray, count: int) -> Points:
     """Random points, uniform by area, on the triangles between some vertices. Corners are indices into these."""
     number = np.full(len(mesh.position), -1)
     number[vertex] = np.arange(len(vertex))

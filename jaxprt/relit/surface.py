@@ -151,7 +151,7 @@ def _from_texels(
     """Radiance that points reflect from single texels of the light."""
     light = texel, excess / picture_rays.FULL, share
     options = {"size": size, "samples": samples, "place": place}
-    return bright_texels.sent(
+    return bright_texels.texel_radiance(
         surface.brdf, sight.frame, sight.wo, light, None, sight.blend, above=sight.above, **options
     )
 

@@ -38,8 +38,10 @@ def leaves(value: PyTree) -> Iterator[tuple[list[str], Any]]:
         yield _names(hint, leaf), leaf
 
 
-def pad(value: Value, size: int) -> Value:  # pyright: ignore[reportInvalidTypeForm]
-    """Transport with `size` vertices, of which those after its own repeat the last one."""
+def pad(value: Value, size: int | None) -> Value:  # pyright: ignore[reportInvalidTypeForm]
+    """Transport with `size` vertices, of which those after its own repeat the last one; None returns it as it is."""
+    if size is None:
+        return value
 
     def longer(axes: list[str], leaf: Any) -> Any:
         if "v" not in axes:

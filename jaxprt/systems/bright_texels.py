@@ -137,7 +137,7 @@ class BrightTexels(VertexSystem):
         texels = light.texel, light.excess / LEVELS, seen
         options = {"size": self.visibility.size, "samples": self.samples}
         brdf = grid.as_argument(self.brdf)
-        bright = sent(brdf, view.frame, view.wo, texels, self.points, view.blend, **options)
+        bright = texel_radiance(brdf, view.frame, view.wo, texels, self.points, view.blend, **options)
         return self.system.combine(light.rest, view.rest) + bright
 
     def at(self, points: Points) -> "BrightTexels":
@@ -327,7 +327,7 @@ def radiance(
     eye = require.position("the eye", eye)
     wo = directions.view(transport.frame, transport.position, eye)
     light = texel, excess, transport.visible(texel)
-    return sent(brdf, transport.frame, wo, light, None, blend, size=transport.size, samples=samples)
+    return texel_radiance(brdf, transport.frame, wo, light, None, blend, size=transport.size, samples=samples)
 
 
 def _floating_excess(transport: Visibility, texel: Array, excess: Array) -> Array:
@@ -339,7 +339,7 @@ def _floating_excess(transport: Visibility, texel: Array, excess: Array) -> Arra
 
 
 @partial(jit, static_argnames=("size", "samples"))
-def sent(
+def texel_radiance(
     brdf: Callable,
     frame: Float[Array, "p 3 3"],
     wo: Float[Array, "p 3"],

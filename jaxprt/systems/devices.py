@@ -44,11 +44,11 @@ class Padded(System):
 
     def shade(self, light: PyTree, materials: Blend | None = None) -> PyTree:
         """Light that arrives at the vertices, padding included."""
-        return self.system.shade(light, self._padded(materials))
+        return self.system.shade(light, self._pad(materials))
 
     def view(self, eye: Float[Array, "3"], materials: Blend | None = None) -> PyTree:
         """The view of the system."""
-        return self.system.view(eye, self._padded(materials))
+        return self.system.view(eye, self._pad(materials))
 
     def combine(self, light: PyTree, view: PyTree) -> Float[Array, "v c"]:
         """Radiance of the vertices, without padding."""
@@ -70,12 +70,12 @@ class Padded(System):
         """Key of the system's light."""
         return self.system.shared_light
 
-    def _padded(self, materials: Blend | None) -> Blend | None:
+    def _pad(self, materials: Blend | None) -> Blend | None:
         protocol.check_blend(materials)
         if materials is None:
             return None
         materials.check(self.count, materials.weight.shape[1])
-        return _padded(materials, self.count, self.system.vertices)
+        return _pad(materials, self.count, self.system.vertices)
 
 
 def shard(value: Value, devices: Sequence[jax.Device]) -> Value:  # pyright: ignore[reportInvalidTypeForm]
@@ -122,10 +122,10 @@ def _even(value: Any, shares: int) -> Any:
         return value
     step = shares * (BLOCK if any("block" in axes for axes, _ in leaves(value)) else 1)
     count = value.vertices
-    return value if count % step == 0 else Padded(_padded(value, count, count + -count % step), count)
+    return value if count % step == 0 else Padded(_pad(value, count, count + -count % step), count)
 
 
-def _padded(value: Value, count: int, size: int) -> Value:
+def _pad(value: Value, count: int, size: int) -> Value:
     """Pads the arrays of `count` vertices to `size` by repeating the last vertex."""
 
     def longer(axes: list[str], leaf: Any) -> Any:

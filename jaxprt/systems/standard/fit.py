@@ -205,7 +205,7 @@ def _zonal(brdf: Channels) -> Float[np.ndarray, "l k"]:
 
 
 def paths(material: StandardMaterial) -> dict[str, np.ndarray]:
-    """Functions of light paths for all roughnesses, and their weights; see `jaxprt.relit.paths.factored`."""
+    """Functions of light paths for all roughnesses, and their weights; see `jaxprt.relit.paths.factor`."""
     scale = np.asarray(material.scale, np.float64)
     matte = np.isin(np.arange(len(scale)), _DIFFUSE)
     place = np.maximum(material.knots, np.log(_WIDTH) / material.power)

@@ -131,7 +131,7 @@ def test_what_parts_send_to_others_has_the_albedo_of_their_brdf(roughness):
     """Narrow lobes too, which are narrower than the texels of the maps of light paths."""
     metal = prt.Part("metal", corner(), TexturedMaterial(metallic=0.4, roughness=roughness))
     shading = of_part(metal)
-    path = paths.factored(shading)
+    path = paths.factor(shading)
     assert path.sent is not None
     assert shading.blend is not None
     each = prt.Blend(jnp.eye(4)[..., None], (jnp.full(4, np.log(roughness)),))
@@ -164,7 +164,7 @@ def test_what_parts_send_to_others_follows_their_roughness():
     """Albedo of each roughness, and what it makes of the harmonics of light."""
     metal = prt.Part("metal", corner(), TexturedMaterial(0.8, metallic=1.0, roughness=0.4))
     shading = of_part(metal)
-    path = paths.factored(shading)
+    path = paths.factor(shading)
     sent = path.sent
     assert sent is not None
     view = jnp.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.8, 0.6]])
