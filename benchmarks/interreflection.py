@@ -146,7 +146,7 @@ def errors(scene: RelitScene, triples: Sequence[Triple], pictures: pathlib.Path 
             np.asarray(image.render(mesh, jnp.asarray(color), camera, background=None))
             for color in radiance(scene, triple)
         ]
-        rough = bounces.gather.coarse(triple.light.radiance, edge=8).reshape(6, 8, 1, 8, 1, 3)
+        rough = cubemap.coarse(triple.light.radiance, edge=8).reshape(6, 8, 1, 8, 1, 3)
         rough = Environment(jnp.broadcast_to(rough, (6, 8, 8, 8, 8, 3)).reshape(6, 64, 64, 3))
         exact, blurred = [], []
         for seed in (0, 1):

@@ -199,8 +199,8 @@ HOST = {
     "systems.dynamic.transport.clustering": "counts",
     "systems.devices": "puts arrays on devices",
     "systems.protocol": "calls the methods of systems; tests/systems/test_protocol.py holds these",
-    "systems.bounces.relight.light_side": "takes half precision; tests/systems/test_protocol.py has scenes",
-    "systems.bounces.relight.collect": "takes half precision; the same",
+    "systems.bounces.tensor.light_side": "takes half precision; tests/systems/test_protocol.py has scenes",
+    "systems.bounces.tensor.collect": "takes half precision; the same",
     "systems.lobe.em": "the steps of lobe.tabulate, and tested through it",
     "systems.separable.factorization.light_errors": "draws its own directions",
     "systems.separable.factorization.tabulate": "checks values",
@@ -770,7 +770,7 @@ EXAMPLES = {
     ),
     "systems.bounces.tensor.scales": example(lambda draw: call((draw.normal(4, 2), draw.normal(2, 3)))),
     "systems.lobe.table.traced_share": example(lambda draw: call(10 + 10 * draw.uniform(5))),
-    "systems.bounces.gather.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
+    "sphere.cubemap.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
     "systems.lamps.relight.ray_share": example(
         lambda draw: call(draw.uniform(5, low=2, high=90), draw.uniform(5, low=0.05, high=0.5))
     ),

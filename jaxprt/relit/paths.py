@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from jaxprt.brdf.varying import Channels
 from jaxprt.relit.channels import Shading
 from jaxprt.systems import bounces, harmonic, separable, standard
-from jaxprt.systems.bounces.varying import FunctionWeights
+from jaxprt.systems.bounces.functions import FunctionWeights
 from jaxprt.systems.standard import StandardTable
 
 _TERMS, _RESOLUTION = 24, 32  # number of terms, and edge of the maps, of BRDFs along light paths

@@ -348,3 +348,27 @@ def _border_index(size: int) -> np.ndarray:
     place = np.einsum("fijac,fijc->fija", _FRAME[face][..., :2, :], world)
     column, row = np.moveaxis(np.clip(np.floor((place + 1) * size / 2).astype(np.int32), 0, size - 1), -1, 0)
     return _freeze(((face * size + row) * size + column).astype(np.int32))
+
+
+@functools.partial(jit, static_argnames=("edge",))
+def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c"]:
+    """Radiance of the texels of coarser faces. Each texel is distributed bilinearly to four coarse texels around it.
+
+    A small sun thus keeps its position to second order; nearest-texel averaging would move it to a texel's center.
+    Constant light is preserved exactly, and flux approximately.
+
+    Args:
+        radiance: Radiance of the fine texels.
+        edge: Edge of the coarse faces in texels.
+
+    Raises:
+        ValueError: The edge of the coarse faces does not divide that of the light's.
+    """
+    size = radiance.shape[1]
+    if edge < 1 or size % edge:
+        raise ValueError(f"the edge of coarse faces must divide the edge of the light's faces, {size}, got {edge}")
+    area, way = solid_angle(size=size)[..., None], direction(size=size)
+    flux = jnp.concatenate([radiance * area, jnp.broadcast_to(area, radiance[..., :1].shape)], -1)
+    shape = jax.ShapeDtypeStruct((6, edge, edge, flux.shape[-1]), flux.dtype)
+    (total,) = jax.linear_transpose(lambda faces: lookup(faces, way), shape)(flux)
+    return (total[..., :-1] / total[..., -1:]).reshape(6 * edge * edge, -1)

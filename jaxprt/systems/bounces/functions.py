@@ -7,21 +7,32 @@ serves all BRDFs. Each function is factored over the two directions, so that a b
 A point receives reflected light from many directions and represents it by a few harmonics. The functions therefore
 minimize the error of the reflected light after smoothing over directions. Fewer factors are then enough than if they
 were chosen for pictures.
+
+The material of a part may vary, in the weights w_k of the channels of its BRDF and in its roughness r:
+
+    H_p = sum_k w_k A(k, p, r)
+
+A is tabulated at knots of r. Light that a vertex sends to other surfaces thus has the same roughness as light that it
+sends to the eye.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt.brdf import grid
 from jaxprt.compile import jit
 from jaxprt.decompose import tucker
 from jaxprt.sphere import harmonics, hemisphere
 from jaxprt.systems.dynamic import reflected
 from jaxprt.systems.dynamic.reflected import Reflected
+from jaxprt.systems.protocol import Blend
 from jaxprt.systems.separable import SeparableBrdf
 
 _RINGS, _SECTORS = 32, 64  # quadrature of a bilinear map times low-order harmonics
@@ -180,3 +191,42 @@ def fixed_weights(brdf: SeparableBrdf) -> Float[Array, "p c"]:
     # Fix the signs, which rounding would decide otherwise.
     axis = axis * np.where(axis.sum(1, keepdims=True) < 0, -1, 1)
     return jnp.asarray(axis[value > _NOTHING * max(value[0], np.finfo(np.float32).tiny)], brdf.view_map.dtype)
+
+
+class FunctionWeights(eqx.Module):
+    """Weights of path functions for the channels of a BRDF.
+
+    Attributes:
+        knot: Increasing values of each parameter; empty for a BRDF without a parameter.
+        factor: Weight of each function p for each channel k at each knot, with one axis for each parameter; one row
+            without knots.
+    """
+
+    knot: tuple[Float[Array, " _"], ...]
+    factor: Float[Array, "*n k p"]
+
+    def __check_init__(self):
+        """Refuses factors for another number of knots."""
+        knots = [len(values) for values in self.knot] or [1]
+        if list(self.factor.shape[:-2]) != knots:
+            raise ValueError(
+                f"the factors must have {knots} rows, one for each knot, got {list(self.factor.shape[:-2])}"
+            )
+
+    def weights(self, blend: Blend) -> Float[Array, "v p c"]:
+        """Weights of the functions for the material of each vertex, given the weights of the BRDF channels there."""
+        return _weights(self, blend)
+
+
+@jit
+def _weights(sent: FunctionWeights, blend: Blend) -> Array:
+    if not sent.knot:
+        return jnp.einsum("kp,vkc->vpc", sent.factor[0], blend.weight, precision="highest")
+    pairs = zip(sent.knot, blend.parameter, strict=True)
+    axis = [grid.neighbors(grid.place(knot, parameter), size=len(knot)) for knot, parameter in pairs]
+    between = [((low, 1 - upper), (low + 1, upper)) for low, upper in axis]
+    total: Array | float = 0.0
+    for corner in itertools.product(*between):
+        share = jnp.asarray(math.prod(part for _, part in corner))
+        total = total + sent.factor[tuple(place for place, _ in corner)] * share[:, None, None]
+    return jnp.einsum("vkp,vkc->vpc", total, blend.weight, precision="highest")

@@ -193,30 +193,6 @@ def rays(
     return result
 
 
-@functools.partial(jit, static_argnames=("edge",))
-def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c"]:
-    """Radiance of the texels of coarser faces. Each texel is distributed bilinearly to four coarse texels around it.
-
-    A small sun thus keeps its position to second order; nearest-texel averaging would move it to a texel's center.
-    Constant light is preserved exactly, and flux approximately.
-
-    Args:
-        radiance: Radiance of the fine texels.
-        edge: Edge of the coarse faces in texels.
-
-    Raises:
-        ValueError: The edge of the coarse faces does not divide that of the light's.
-    """
-    size = radiance.shape[1]
-    if edge < 1 or size % edge:
-        raise ValueError(f"the edge of coarse faces must divide the edge of the light's faces, {size}, got {edge}")
-    area, way = cubemap.solid_angle(size=size)[..., None], cubemap.direction(size=size)
-    flux = jnp.concatenate([radiance * area, jnp.broadcast_to(area, radiance[..., :1].shape)], -1)
-    shape = jax.ShapeDtypeStruct((6, edge, edge, flux.shape[-1]), flux.dtype)
-    (total,) = jax.linear_transpose(lambda faces: cubemap.lookup(faces, way), shape)(flux)
-    return (total[..., :-1] / total[..., -1:]).reshape(6 * edge * edge, -1)
-
-
 def shares(normal: Float[np.ndarray, "b 3"], *, size: int) -> Float[np.ndarray, "b d"]:
     """Fraction that each texel contributes to the irradiance of points under uniform light. Rows sum to one."""
     flux = np.maximum(normal @ np.asarray(cubemap.vector_area(size=size), np.float32).reshape(-1, 3).T, 0)

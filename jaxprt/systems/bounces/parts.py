@@ -20,11 +20,10 @@ from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
 from jaxprt.systems import harmonic
 from jaxprt.systems.bounces import traced
+from jaxprt.systems.bounces.functions import FunctionWeights
 from jaxprt.systems.bounces.jobs import DEGREE
-from jaxprt.systems.bounces.relight import LitTransfer, collect, light_side
-from jaxprt.systems.bounces.tensor import TransferTensor
+from jaxprt.systems.bounces.tensor import LitTransfer, TransferTensor, collect, light_side
 from jaxprt.systems.bounces.traced import ReflectionRays
-from jaxprt.systems.bounces.varying import FunctionWeights
 from jaxprt.systems.harmonic import HarmonicBrdf
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.lobe.table import Lobes

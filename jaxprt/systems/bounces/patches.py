@@ -273,7 +273,7 @@ class DiffuseExchange(NamedTuple):
 
     def lit(self, environment: Environment) -> Float[np.ndarray, "v c"]:
         """Irradiance over pi of each vertex from an environment."""
-        return self.light @ np.asarray(gather.coarse(environment.radiance, edge=math.isqrt(self.light.shape[1] // 6)))
+        return self.light @ np.asarray(cubemap.coarse(environment.radiance, edge=math.isqrt(self.light.shape[1] // 6)))
 
     def reflected(
         self, source: Float[np.ndarray, "v c"], albedo: Float[np.ndarray, "j c"], *, bounces: int

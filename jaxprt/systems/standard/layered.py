@@ -19,7 +19,7 @@ from jaxprt import require
 from jaxprt.brdf import GGX, Charlie, CoatedModel, MetallicRoughness, UnderSheen, coat_reflectance, sheen_albedo
 from jaxprt.brdf.varying import Channels
 from jaxprt.systems.bounces import traced
-from jaxprt.systems.bounces.varying import FunctionWeights
+from jaxprt.systems.bounces.functions import FunctionWeights
 from jaxprt.systems.dynamic import DynamicBrdf
 from jaxprt.systems.harmonic import HarmonicBrdf
 from jaxprt.systems.lobe import LobeBrdf

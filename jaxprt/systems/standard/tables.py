@@ -20,7 +20,7 @@ from jaxprt import require
 from jaxprt.sphere import harmonics, hemisphere
 from jaxprt.systems import dynamic, lobe
 from jaxprt.systems.bounces import traced
-from jaxprt.systems.bounces.varying import FunctionWeights
+from jaxprt.systems.bounces.functions import FunctionWeights
 from jaxprt.systems.dynamic import DynamicBrdf
 from jaxprt.systems.harmonic import HarmonicBrdf
 from jaxprt.systems.lobe import LobeBrdf

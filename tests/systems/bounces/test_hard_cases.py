@@ -122,10 +122,10 @@ def test_a_sun_in_one_texel_reaches_no_vertex_twice_over():
     mesh = scene(ball(height=1.2), floor())
     sun = jnp.zeros((6, SIZE, SIZE, 1)).at[2, 3, 4].set(1e4)
     first, more, tensor = bounced(mesh, [1.0, 1.0], Environment(sun))
-    soft = bounces.gather.coarse(sun, edge=2)
+    soft = cubemap.coarse(sun, edge=2)
     flux = (float(jnp.sum(each.ravel() * cubemap.solid_angle(size=n).ravel())) for each, n in ((soft, 2), (sun, SIZE)))
     assert next(flux) == pytest.approx(next(flux), rel=1e-5)
-    lit, again = (bounces.relight.light_side(tensor, Environment(x)) for x in (sun, soft.reshape(6, 2, 2, 1)))
+    lit, again = (bounces.tensor.light_side(tensor, Environment(x)) for x in (sun, soft.reshape(6, 2, 2, 1)))
     for one, other in zip(jax.tree.leaves(lit), jax.tree.leaves(again), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5 * np.abs(other).max())
     assert np.abs(more).max() < first.max()

@@ -68,13 +68,13 @@ def test_every_bounce_adds_half_of_the_one_before_and_is_worth_it():
     assert rest.shape == (3,)
     np.testing.assert_allclose(rest[2], 0.125, rtol=0.03)
     white = jnp.ones((len(tensor.function), 1))
-    lit = bounces.relight.light_side(tensor, SKY)
+    lit = bounces.tensor.light_side(tensor, SKY)
 
     def arriving(count):
         patches = tensor.patches
         own = bounces.Patches(**{**vars(patches), "bounces": count})
         held = bounces.TransferTensor(**{**vars(tensor), "patches": own})
-        whole = bounces.relight.collect(held, lit, white * tensor.factor[0])
+        whole = bounces.tensor.collect(held, lit, white * tensor.factor[0])
         return float(jnp.mean(whole[0])) * np.sqrt(4 * np.pi)
 
     each = np.array([arriving(count) for count in (2, 3, 4, 5, None)])

@@ -14,7 +14,7 @@ from jaxprt.brdf.varying import Channels
 from jaxprt.scene import Environment, builtin
 from jaxprt.scene.mesh import ground_plane, join, make_mesh
 from jaxprt.sphere import cubemap, directions, haar, harmonics
-from jaxprt.systems.bounces.relight import LitTransfer
+from jaxprt.systems.bounces.tensor import LitTransfer
 from jaxprt.visibility import Run
 
 # Edges of cubemap faces: EDGE divides the light, SIZE the rays between surfaces, SEEN the visibility of the light.
@@ -53,10 +53,10 @@ def light(seed, edge=EDGE):
 
 def arriving(tensor, environment, weight=None):
     """SH coefficients of one bounce and of two, [v s c]."""
-    lit = bounces.relight.light_side(tensor, environment)
+    lit = bounces.tensor.light_side(tensor, environment)
     if weight is None:
         weight = jnp.concatenate([jnp.broadcast_to(each, (len(each), 3)) for each in tensor.factor])[tensor.function]
-    both, one = (np.asarray(bounces.relight.collect(tensor, x, weight)) for x in (lit, LitTransfer(lit.first, None)))
+    both, one = (np.asarray(bounces.tensor.collect(tensor, x, weight)) for x in (lit, LitTransfer(lit.first, None)))
     return one.transpose(2, 0, 1), (both - one).transpose(2, 0, 1)
 
 
@@ -126,7 +126,7 @@ def test_two_bounces_are_a_loop_over_rays_of_rays(mesh, brdfs, whole):
     lamp.reshape(-1)[texel] = 1
     lamp = np.broadcast_to(lamp, (6, 2, fold, 2, fold)).reshape(6, SEEN, SEEN, 1)
     lamp = Environment(jax.device_put(lamp))
-    held = np.asarray(bounces.gather.coarse(lamp.radiance, edge=2)).reshape(6, 2, 1, 2, 1)
+    held = np.asarray(cubemap.coarse(lamp.radiance, edge=2)).reshape(6, 2, 1, 2, 1)
     shone = np.broadcast_to(held, (6, 2, fold, 2, fold)).reshape(-1)  # The lamp and some of what is around it.
     once = gather(shone[:, None] * np.asarray(seen)[..., None] / 16 * np.ones(3), SEEN)
     shining = np.asarray(harmonics.evaluate(way, degree=3)) * np.asarray(cubemap.solid_angle(size=SIZE)).reshape(-1, 1)
@@ -257,14 +257,14 @@ def test_channels_with_weights_are_worth_what_the_brdf_is_that_they_add_up_to(me
 
 
 def test_a_coarse_light_is_where_the_light_is():
-    np.testing.assert_allclose(bounces.gather.coarse(jnp.full((6, 16, 16, 1), 0.3), edge=4), 0.3, rtol=1e-5)
+    np.testing.assert_allclose(cubemap.coarse(jnp.full((6, 16, 16, 1), 0.3), edge=4), 0.3, rtol=1e-5)
     fine = jnp.asarray(np.random.default_rng(1).uniform(size=(6, 16, 16, 3)), jnp.float32)
     wide, narrow = (np.asarray(cubemap.solid_angle(size=n)).reshape(-1, 1) for n in (4, 16))
-    flux = np.sum(bounces.gather.coarse(fine, edge=4) * wide, 0)
+    flux = np.sum(cubemap.coarse(fine, edge=4) * wide, 0)
     np.testing.assert_allclose(flux, (narrow * fine.reshape(-1, 3)).sum(0), rtol=0.002)
-    np.testing.assert_allclose(bounces.gather.coarse(fine, edge=16), fine.reshape(-1, 3), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(cubemap.coarse(fine, edge=16), fine.reshape(-1, 3), rtol=1e-5, atol=1e-6)
     with pytest.raises(ValueError, match="the light's faces, 16, got 5"):
-        bounces.gather.coarse(fine, edge=5)
+        cubemap.coarse(fine, edge=5)
 
 
 @pytest.mark.parametrize("size", [4, 8])
@@ -275,7 +275,7 @@ def test_the_middle_of_a_sun_stays_in_place(size):
     texels = np.random.default_rng(2).integers(0, 64**2, 60)
     suns = np.zeros((6 * 64**2, len(texels)), np.float32)
     suns[texels, np.arange(len(texels))] = 1  # A color for each.
-    flux = np.asarray(bounces.gather.coarse(jax.device_put(suns.reshape(6, 64, 64, -1)), edge=size)) * area[:, None]
+    flux = np.asarray(cubemap.coarse(jax.device_put(suns.reshape(6, 64, 64, -1)), edge=size)) * area[:, None]
     at = fine[texels]
     own = np.sort(np.abs(at))[:, 1] <= 1 - 1 / size  # Others are shared with other faces.
     flux, at = flux[:, own], at[own]
