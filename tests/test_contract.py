@@ -89,8 +89,6 @@ HOST = {
     "systems.separable.sparse.precompute": "traces rays",
     "benchmarks.published.factorization": "checks values",
     "benchmarks.published.lobes.mirror_lobes": "checks values",
-    "benchmarks.published.lobes.BrdfSet": "a BRDF of BRDFs",
-    "benchmarks.published.lobes.SetMember": "a BRDF of BRDFs",
     "benchmarks.published.interreflection": "traces rays",
     "benchmarks.published.transfer": "takes half precision; tests/figures/test_transfer.py",
     "benchmarks.published.tensors.hooi": "gives vectors of either sign",

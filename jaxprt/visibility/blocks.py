@@ -153,7 +153,7 @@ class Run:
         return self if self.path is None else replace(self, path=os.path.join(self.path, name))
 
 
-def compute(job: Job, run: Run = Run(), *, label: str = "precompute") -> dict[str, np.ndarray]:
+def compute(job: Job, run: Run, *, label: str = "precompute") -> dict[str, np.ndarray]:
     """Computes all blocks of a job.
 
     With a path, the worker that computes a block also writes it, if it can access the folder.

@@ -116,11 +116,11 @@ def same(first, second):
 @pytest.mark.parametrize("vertices", [1, 3, 4, 5, 30, 32])
 def test_results_are_cut_to_the_vertices(vertices):
     job = Squares(vertices)
-    check(visibility.blocks.compute(job), job)
+    check(visibility.blocks.compute(job, prt.Run()), job)
 
 
 def test_a_progress_bar_ends_full_and_tells_the_rays(capsys):
-    visibility.blocks.compute(Squares(), label="squares")
+    visibility.blocks.compute(Squares(), prt.Run(), label="squares")
     told = capsys.readouterr().err
     assert "squares: 100%" in told
     assert "30.0/30.0" in told
