@@ -31,7 +31,7 @@ import pytest
 
 import jaxprt
 from benchmarks import published
-from benchmarks.published.lobes import Remainder
+from benchmarks.published.lobes import BrdfSet, Remainder
 from benchmarks.published.quantized import quantize
 from jaxprt import brdf, dynamic, scene, visibility
 from jaxprt import harmonic as harmonic_system
@@ -90,6 +90,7 @@ HOST = {
     "benchmarks.published.factorization": "checks values",
     "benchmarks.published.lobes.mirror_lobes": "checks values",
     "benchmarks.published.interreflection": "traces rays",
+    "benchmarks.published.lobes.SetMember": "takes an index",
     "benchmarks.published.transfer": "takes half precision; tests/figures/test_transfer.py",
     "benchmarks.published.tensors.hooi": "gives vectors of either sign",
     "systems.axes": "reads annotations",
@@ -652,6 +653,11 @@ EXAMPLES = {
     "systems.dynamic.transport.light_factors": example(lambda draw: call(draw.tensor())),
     "systems.bounces.functions.albedo": example(lambda draw: call(draw.separable())),
     "systems.bounces.functions.project": example(lambda draw: call(draw.separable()), degree=2),
+    "benchmarks.published.lobes.BrdfSet": example(
+        lambda draw: call(
+            BrdfSet.of([brdf.Lambert(draw.uniform(1)), brdf.Lambert(draw.uniform(1))]), draw.upper(5), draw.upper(5)
+        ),
+    ),
     "benchmarks.published.lobes.Remainder": example(
         lambda draw: call(Remainder(brdf.Lambert(draw.uniform(3)), draw.lobes()), draw.upper(5), draw.upper(5)),
     ),
