@@ -26,7 +26,7 @@ from jaxprt.systems.bounces.tensor import LitTransfer, TransferTensor, collect, 
 from jaxprt.systems.bounces.traced import ReflectionRays
 from jaxprt.systems.harmonic import HarmonicBrdf
 from jaxprt.systems.lobe import LobeBrdf
-from jaxprt.systems.lobe.table import Lobes
+from jaxprt.systems.lobe.table import LobeMixture
 from jaxprt.systems.protocol import Blend
 
 
@@ -131,7 +131,7 @@ class ReflectingPart(eqx.Module):
         """Factor of the radiance along each ray. The sum over the rays of a point is the albedo of its traced lobes."""
         return traced.weights(self._lobes(eye, _parameter(blend), points), rays, blend, seen)
 
-    def _lobes(self, eye: Array, parameter: tuple[Array, ...], points: Points | None) -> Lobes:
+    def _lobes(self, eye: Array, parameter: tuple[Array, ...], points: Points | None) -> LobeMixture:
         if self.lobe is None:
             raise ValueError("rays need a part with lobes, got one that reflects by harmonics alone")
         return traced.lookup(self.lobe, *placed(self.position, self.frame, points), eye, parameter)

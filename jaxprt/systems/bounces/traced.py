@@ -23,7 +23,7 @@ from jaxprt.decompose import mixture
 from jaxprt.sphere import directions, harmonics
 from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.lobe import LobeBrdf
-from jaxprt.systems.lobe.table import Lobes, traced_share
+from jaxprt.systems.lobe.table import LobeMixture, traced_share
 from jaxprt.systems.protocol import Blend
 
 FEW = 0.55  # traced fraction of what a BRDF's lobes reflect, below which rays bring nothing
@@ -98,13 +98,13 @@ def lookup(
     frame: Float[Array, "v 3 3"],
     eye: Float[Array, "*p 3"],
     parameter: tuple[Float[Array, " v"], ...],
-) -> Lobes:
+) -> LobeMixture:
     """The lobes of points towards the eye."""
     return table.lookup(directions.view(frame, position, eye), *parameter)
 
 
 @jit
-def harmonics_of(lobes: Lobes, blend: Blend | None, seen: Float[Array, " v"] | None) -> Float[Array, "lm c v"]:
+def harmonics_of(lobes: LobeMixture, blend: Blend | None, seen: Float[Array, " v"] | None) -> Float[Array, "lm c v"]:
     """Harmonics, in local frames, of what rays represent.
 
     Args:
@@ -124,7 +124,7 @@ def harmonics_of(lobes: Lobes, blend: Blend | None, seen: Float[Array, " v"] | N
 
 @partial(jit, static_argnames="count")
 def quantiles(
-    lobes: Lobes, seen: Float[Array, " v"] | None, position: Array, frame: Float[Array, "v 3 3"], *, count: int
+    lobes: LobeMixture, seen: Float[Array, " v"] | None, position: Array, frame: Float[Array, "v 3 3"], *, count: int
 ) -> ReflectionRays:
     """The rays of each point: quantiles of the mixture of its narrow lobes, rotated by a random angle.
 
@@ -157,7 +157,7 @@ def quantiles(
 
 @jit
 def weights(
-    lobes: Lobes, rays: ReflectionRays, blend: Blend | None, seen: Float[Array, " v"] | None
+    lobes: LobeMixture, rays: ReflectionRays, blend: Blend | None, seen: Float[Array, " v"] | None
 ) -> Float[Array, "j v c"]:
     """Factor of the radiance along each ray. The sum over the rays of a point is the albedo of its traced lobes."""
     lobe_weight = _traced_weight(lobes, blend, seen)
@@ -168,7 +168,7 @@ def weights(
     return weight * (albedo / jnp.where(total > _TINY, total, 1))
 
 
-def _traced_weight(lobes: Lobes, blend: Blend | None, seen: Array | None) -> Float[Array, "c l v"]:
+def _traced_weight(lobes: LobeMixture, blend: Blend | None, seen: Array | None) -> Float[Array, "c l v"]:
     """Weight of the traced fraction of each lobe in each color."""
     traced = traced_share(lobes.concentration)
     weight = lobes.weight * (traced if seen is None else traced * seen)

@@ -34,7 +34,7 @@ from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import directions
 from jaxprt.systems.lamps.transport import LampTransport
 from jaxprt.systems.lobe import LobeBrdf
-from jaxprt.systems.lobe.table import Lobes, traced_share
+from jaxprt.systems.lobe.table import LobeMixture, traced_share
 from jaxprt.systems.protocol import Blend, check_blend
 
 _SMALL, _LARGE = 0.5, 2.0  # squared chords, in variances of the lobe, between which the two approximations blend
@@ -183,7 +183,7 @@ def ray_share(concentration: Float[Array, "*b"], chord: Float[Array, "*c"]) -> F
     return place**2 * (3 - 2 * place)
 
 
-def _reflect(lobe: Lobes, frame: Array, traced: Array | None, piece: tuple[Array, ...]) -> Float[Array, "k v"]:
+def _reflect(lobe: LobeMixture, frame: Array, traced: Array | None, piece: tuple[Array, ...]) -> Float[Array, "k v"]:
     """Radiance reflected by each channel of the BRDF, from one piece of a lamp of radiance 1."""
     solid, way, matte, whole = piece
     length = jnp.sqrt(jnp.maximum(jnp.sum(way**2, 0), _TINY))

@@ -28,7 +28,7 @@ from jaxprt.systems.lobe import diffuse
 from jaxprt.systems.lobe.blurred_light import LobeLight, prefilter, scales
 from jaxprt.systems.lobe.exported import DEGREE, CoarseTransport, ExportedLobes
 from jaxprt.systems.lobe.pyramid import LobeTransport, between, corners
-from jaxprt.systems.lobe.table import LobeBrdf, Lobes
+from jaxprt.systems.lobe.table import LobeBrdf, LobeMixture
 from jaxprt.systems.protocol import Blend
 
 _LEAST = 1e-3  # smallest visibility by which the shift of a lobe is divided
@@ -220,7 +220,7 @@ def _view_lobes(
 @isolated
 def _places(
     position: Array, frame: Array, brdf: LobeBrdf, eye: Array, variance: Array | None, *parameter: Array
-) -> tuple[Lobes, tuple[Array, ...]]:
+) -> tuple[LobeMixture, tuple[Array, ...]]:
     """Lobes of each vertex; and cubemap face, coordinates s and t on it, and spread of each lobe."""
     lobe = brdf.lookup(directions.view(frame, position, eye), *parameter)
     lobe = lobe if variance is None else lobe.widened(variance)

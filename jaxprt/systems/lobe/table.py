@@ -36,7 +36,7 @@ _GRAZING = 1e-3  # smallest cosine by which the lobes are divided
 WIDE, NARROW = 8.0, 32.0  # concentrations below which harmonics represent a lobe, and above which rays do
 
 
-class Lobes(eqx.Module):
+class LobeMixture(eqx.Module):
     """Lobes l of BRDF x cosine for views v, in local frames.
 
     Attributes:
@@ -58,14 +58,14 @@ class Lobes(eqx.Module):
         value = jnp.sum(self.weight * density, 1) + self.diffuse * wi[:, 2] / np.pi
         return jnp.where(wi[:, 2] > 0, value, 0)
 
-    def widened(self, variance: Float[Array, " v"]) -> "Lobes":
+    def widened(self, variance: Float[Array, " v"]) -> "LobeMixture":
         """The lobes averaged over directions of some variance, in squared radians along one axis, at each view.
 
         A lobe near the horizon is widened less, so that little of it falls below, where nothing is seen.
         """
         variance = jnp.minimum(variance, jnp.maximum(self.mean[2], 0) ** 2 / 2)
         concentration = self.concentration / (1 + self.concentration * variance)
-        return Lobes(self.mean, concentration, self.weight, self.diffuse)
+        return LobeMixture(self.mean, concentration, self.weight, self.diffuse)
 
 
 class LobeBrdf(eqx.Module):
@@ -127,7 +127,7 @@ class LobeBrdf(eqx.Module):
             result = _mean(result, jnp.zeros_like(knot).at[low].set(1 - upper).at[low + 1].set(upper))
         return result
 
-    def lookup(self, wo: Float[Array, "v 3"], *parameter: Float[Array, " v"]) -> Lobes:
+    def lookup(self, wo: Float[Array, "v 3"], *parameter: Float[Array, " v"]) -> LobeMixture:
         """Lobes for given views, interpolated between the nodes. Views below the horizon get weights of zero.
 
         Args:
@@ -171,7 +171,7 @@ class LobeBrdf(eqx.Module):
         length = jnp.sqrt(jnp.maximum(x**2 + y**2 + z**2, _TINY))
         up = jnp.where(wo[:, 2] > 0, jnp.ones_like(sin_o), 0)
         strength = strength.reshape(len(self.weight), self.lobes, len(wo))
-        return Lobes(jnp.stack([x, y, z]) / length, jnp.exp(scale), strength * up, diffuse * up)
+        return LobeMixture(jnp.stack([x, y, z]) / length, jnp.exp(scale), strength * up, diffuse * up)
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """BRDF x cosine of wi in 1/sr, reconstructed from the lobes. It is zero below the horizon."""

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxprt.compile import jit, total
 from jaxprt.sphere import cubemap, directions
 from jaxprt.systems.bright_texels import BrightLight, BrightTexels
-from jaxprt.systems.lobe.table import Lobes
+from jaxprt.systems.lobe.table import LobeMixture
 from jaxprt.systems.protocol import Blend, System
 from jaxprt.visibility import LEVELS
 
@@ -30,7 +30,7 @@ class WidenedView(eqx.Module):
     """
 
     rest: PyTree
-    lobe: Lobes
+    lobe: LobeMixture
     frame: Float[Array, "v 3 3"]
 
 
@@ -55,7 +55,7 @@ def view(system: Any, eye: Float[Array, "*p 3"], blend: Blend | None, variance: 
     lobe = lobes.brdf.lookup(directions.view(frame, position, eye), *(() if blend is None else blend.parameter))
     rest = inner.view(eye, blend, variance)
     looked = rest if inner is lobes else rest.lobes
-    lobe = Lobes(lobe.mean, lobe.concentration, looked.weight, looked.diffuse).widened(variance)
+    lobe = LobeMixture(lobe.mean, lobe.concentration, looked.weight, looked.diffuse).widened(variance)
     return WidenedView(rest, lobe, frame)
 
 

@@ -252,7 +252,7 @@ def _factor_for(brdf: Callable, light: Sequence[Environment], terms: int | None,
 
 
 @runtime_checkable
-class Terms(Protocol):
+class FactoredBrdf(Protocol):
     """A BRDF given by a light factor and a view factor for each term, such as `jaxprt.separable.SeparableBrdf`."""
 
     def light(self, wi: Float[Array, "*b 3"]) -> Float[Array, "*b r l"]:
@@ -265,7 +265,7 @@ class Terms(Protocol):
 
 
 def light_errors(
-    brdf: Callable, factored: Terms, light: Environment, *, frames: int = 32, views: int = 32
+    brdf: Callable, factored: FactoredBrdf, light: Environment, *, frames: int = 32, views: int = 32
 ) -> Float[Array, " r"]:
     """Relative L2 error of radiance reflected under a light, without shadows, for each number of terms.
 
@@ -291,7 +291,7 @@ def light_errors(
 
 
 @jit
-def _light_errors(brdf: Callable, factored: Terms, light: Environment, normal: Array, view: Array) -> Array:
+def _light_errors(brdf: Callable, factored: FactoredBrdf, light: Environment, normal: Array, view: Array) -> Array:
     size = light.radiance.shape[1]
     direction, area = (quantity(size=size).reshape(-1, 3) for quantity in (cubemap.direction, cubemap.vector_area))
     table = light.radiance.reshape(len(direction), -1)

@@ -11,7 +11,7 @@ from jaxprt.scene import Environment, builtin
 from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.scene.points import Points
 from jaxprt.systems.lobe import widened
-from jaxprt.systems.lobe.table import Lobes
+from jaxprt.systems.lobe.table import LobeMixture
 
 pytestmark = pytest.mark.usefixtures("few_samples")
 SIZE = 16
@@ -59,7 +59,7 @@ def test_a_widened_lobe_is_the_mean_over_directions():
     wi /= np.linalg.norm(wi, axis=1, keepdims=True)
     expected = np.exp(concentration * (wi @ turned.T - 1)).mean(1) * concentration / (2 * np.pi)
     ones = jnp.ones((1, 1, 1))
-    one = Lobes(jnp.asarray(mean)[:, None, None], concentration * ones[0], ones, 0 * ones[0])
+    one = LobeMixture(jnp.asarray(mean)[:, None, None], concentration * ones[0], ones, 0 * ones[0])
     value = jax.jit(lambda lobes, wi: lobes.widened(jnp.full(1, variance)).evaluate(wi)[0])
     np.testing.assert_allclose(value(one, jnp.asarray(wi)), expected, atol=0.02 * expected.max())
 
