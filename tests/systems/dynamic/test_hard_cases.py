@@ -69,7 +69,7 @@ def system(mesh, table):
 
 
 def color(system, place, light, eye=EYE, diffuse=0.2, specular=1.0):
-    weight = np.broadcast_to(np.float32([[diffuse], [specular]]), (system.vertices, 2, 1))
+    weight = np.broadcast_to(np.array([[diffuse], [specular]], np.float32), (system.vertices, 2, 1))
     blend = prt.Blend(weight, (np.full(system.vertices, place, np.float32),))
     return np.asarray(prt.radiance(system, light, eye=jnp.asarray(eye), materials=blend))
 
