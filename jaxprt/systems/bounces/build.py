@@ -93,31 +93,31 @@ def precompute(
     parts["function"] = np.arange(len(white))
     sizes = {"components": components, "modes": min(modes, 6 * edge * edge), "size": size}
     job = _job(mesh, brdfs, np.searchsorted(numbers, mesh.region), edge, lamps, run, parts, sizes)
-    found, member = visibility.blocks.compute(job, run.within("clusters"), label="bounce"), job.member
-    contribution = _contributions(found["energy"], job.scale)
+    blocks, member = visibility.blocks.compute(job, run.within("clusters"), label="bounce"), job.member
+    contribution = _contributions(blocks["energy"], job.scale)
     function = np.flatnonzero(contribution >= least)
-    worth = [_rms(found["white"])]
-    weight, core, lamp = found["weight"].reshape(*member.shape, -1), found["core"][..., function], None
+    worth = [_rms(blocks["white"])]
+    weight, core, lamp = blocks["weight"].reshape(*member.shape, -1), blocks["core"][..., function], None
     if lamps is not None:
-        lamp = found["lamp_weight"].reshape(*member.shape, -1), found["lamp"][..., function]
+        lamp = blocks["lamp_weight"].reshape(*member.shape, -1), blocks["lamp"][..., function]
     job, parts = job.without_response(), None
     second, brought_twice = None, np.zeros(0)
     if bounces != 1 and function.size:
         fewer = min(twice(components), member.shape[1])
-        again = job.again(weight, core, found["mode"], lamp, function, components=fewer)
+        again = job.again(weight, core, blocks["mode"], lamp, function, components=fewer)
         second, brought_twice = _second(again, member, job.white[function], least, run)
         worth.append(_rms(brought_twice))
     exchange = _Exchange(mesh, job, patches, None if bounces == ALL else int(bounces), run)
     whole = weight if lamp is None else np.concatenate([weight, lamp[0]], -1)
-    made = exchange.make(function, whole, None if second is None else np.asarray(second.weight), edge, lamps)
+    exchanged = exchange.make(function, whole, None if second is None else np.asarray(second.weight), edge, lamps)
     if second is not None and bounces != 2:
-        worth += exchange.worth(made, job.white[function], function, brought_twice)
+        worth += exchange.worth(exchanged, job.white[function], function, brought_twice)
     if run.progress:
         _tell(contribution, function, worth, second, bounces)
     rows = (members.places(member), job.region.astype(np.int32), areas(mesh).astype(whole.dtype))
-    arrays = [jax.device_put(column) for column in (whole, core, found["mode"], *rows, function)]
-    made_of = {"factor": factor, "second": second, "patches": made}
-    made_of |= {"lamp": None if lamp is None else jax.device_put(lamp[1]), "error": jnp.asarray(found["error"])}
+    arrays = [jax.device_put(column) for column in (whole, core, blocks["mode"], *rows, function)]
+    made_of = {"factor": factor, "second": second, "patches": exchanged}
+    made_of |= {"lamp": None if lamp is None else jax.device_put(lamp[1]), "error": jnp.asarray(blocks["error"])}
     return TransferTensor(*arrays, **made_of, worth=jnp.asarray(worth, arrays[0].dtype))
 
 
@@ -168,13 +168,13 @@ class _Exchange(NamedTuple):
         lamps: LampTransport | None,
     ) -> Patches:
         """The patches, given the weights of the components of one bounce and of two, and the lamps."""
-        position, normal = (np.asarray(each, np.float64) for each in (self.mesh.position, self.mesh.normal))
+        position, normal = (np.asarray(column, np.float64) for column in (self.mesh.position, self.mesh.normal))
         count = min(self.wanted, max(1, len(position) // patches.LEAST))
         member, region = self.job.member, self.job.region
         patch, of_region, of_cluster = patches.divide(position, normal, region, member, patches=count)
         size = self.job.size
         job = patches.PatchJob.make(self.mesh, None, None, size, patch=patch, edge=math.gcd(size, edge))
-        found = visibility.blocks.compute(job, self.run.within("patches"), label="patches")
+        traced = visibility.blocks.compute(job, self.run.within("patches"), label="patches")
         area = areas(self.mesh)
         mean = patches.Means(patch, area, len(of_region))
         place = members.places(member)
@@ -186,14 +186,14 @@ class _Exchange(NamedTuple):
         strength, first = [], 0
         albedo = [np.asarray(functions.albedo(basis)) for basis in self.job.bases]
         for kind in self.job.basis:
-            own = albedo[kind]
-            kept = np.isin(np.arange(first, first + len(own)), function)
-            strength.append(jnp.asarray(np.where(kept, own, 0)))
-            first += len(own)
-        arrays = (found["factor"], found["spread"], patch, of_region, of_cluster)
-        ours = (mean.of(found["factor"]), mean.of(found["light"]), of_components(weight))
+            of_basis = albedo[kind]
+            present = np.isin(np.arange(first, first + len(of_basis)), function)
+            strength.append(jnp.asarray(np.where(present, of_basis, 0)))
+            first += len(of_basis)
+        arrays = (traced["factor"], traced["spread"], patch, of_region, of_cluster)
+        ours = (mean.of(traced["factor"]), mean.of(traced["light"]), of_components(weight))
         second = None if again is None else jnp.asarray(of_components(again))
-        factor, spread, *of_patch, between, light, once = (jnp.asarray(each) for each in (*arrays, *ours))
+        factor, spread, *of_patch, between, light, once = (jnp.asarray(column) for column in (*arrays, *ours))
         more = {"second": second, "strength": tuple(strength), "bounces": self.bounces}
         if lamps is not None:
             pieces = mean.of(np.asarray(lamps.cosine).T / np.float32(np.pi))
@@ -201,19 +201,19 @@ class _Exchange(NamedTuple):
             more["lamp"] = jnp.asarray(pieces @ of_lamp.astype(pieces.dtype))
         return Patches(factor, spread, *of_patch, between=between, light=light, first=once, **more)
 
-    def worth(self, made: Patches, white: np.ndarray, function: np.ndarray, twice: np.ndarray) -> list[float]:
+    def worth(self, between: Patches, white: np.ndarray, function: np.ndarray, twice: np.ndarray) -> list[float]:
         """Worth of the bounces after the second: one value for each bounce, or one for all of them together."""
         place = members.places(self.job.member)
-        mean = patches.Means(np.asarray(made.patch), areas(self.mesh), len(made.region))
-        rho = np.asarray(made.albedo(jnp.asarray(function), jnp.asarray(white[:, None], made.light.dtype)))
+        mean = patches.Means(np.asarray(between.patch), areas(self.mesh), len(between.region))
+        rho = np.asarray(between.albedo(jnp.asarray(function), jnp.asarray(white[:, None], between.light.dtype)))
         start = rho * mean.of(twice[place][:, None]).astype(rho.dtype)
-        factor = np.asarray(made.factor, np.float32)
+        factor = np.asarray(between.factor, np.float32)
         if self.bounces is None:
-            return [_rms(factor @ np.asarray(made.settled(jnp.minimum(rho, patches.MOST), jnp.asarray(start))))]
+            return [_rms(factor @ np.asarray(between.settled(jnp.minimum(rho, patches.MOST), jnp.asarray(start))))]
         result = []
         for _ in range(self.bounces - 2):
             result.append(_rms(factor @ start))
-            start = rho * (np.asarray(made.between) @ start)
+            start = rho * (np.asarray(between.between) @ start)
         return result
 
 
@@ -221,8 +221,8 @@ def _regions(mesh: Mesh, brdfs: Sequence) -> np.ndarray:
     """Numbers of the regions. Refuses a list that does not have one BRDF for each region."""
     if not isinstance(mesh, Mesh) or not isinstance(brdfs, Sequence):
         raise TypeError(f"mesh must be a Mesh and brdfs a list, got {type(mesh).__name__} and {type(brdfs).__name__}")
-    for number, each in enumerate(brdfs):
-        require.kind(f"the BRDF of region {number}", each, SeparableBrdf, source="jaxprt.separable.factor")
+    for number, brdf in enumerate(brdfs):
+        require.kind(f"the BRDF of region {number}", brdf, SeparableBrdf, source="jaxprt.separable.factor")
     numbers = np.unique(np.asarray(mesh.region))
     if len(brdfs) != len(numbers):
         raise ValueError(f"brdfs must be one for each of the regions {numbers.tolist()}, got {len(brdfs)}")
@@ -235,13 +235,13 @@ def _check_weights(weights: Sequence[Array | None], brdfs: Sequence[SeparableBrd
         raise ValueError(
             f"weights must have one entry, an array or None, for each of {len(brdfs)} regions, got {len(weights)}"
         )
-    for number, (each, brdf) in enumerate(zip(weights, brdfs, strict=True)):
-        if each is None:
+    for number, (weight, brdf) in enumerate(zip(weights, brdfs, strict=True)):
+        if weight is None:
             continue
-        shape, channels = np.shape(each), brdf.view_map.shape[-1]
+        shape, channels = np.shape(weight), brdf.view_map.shape[-1]
         if len(shape) != 2 or shape[0] != channels:
             raise ValueError(f"the weights of region {number} must be [{channels} channels, c], got {list(shape)}")
-        require.finite(f"the weights of region {number}", each)
+        require.finite(f"the weights of region {number}", weight)
 
 
 def _check_sizes(
@@ -272,10 +272,12 @@ def _responses(
     for number, basis in enumerate(bases):
         vertex = np.flatnonzero(kind == number)
         job = jobs.ResponseJob.make(mesh, None, vertex, _SEEN * edge, basis=basis, edge=edge)
-        found = visibility.blocks.compute(job, run.within(f"response_{number}"), label=f"response {number}")["response"]
-        texels, terms = found.shape[1:]
-        padded = np.zeros((shared_size(len(vertex)), terms, texels + count), found.dtype)
-        padded[: len(vertex), :, :texels] = found.swapaxes(1, 2)
+        response = visibility.blocks.compute(job, run.within(f"response_{number}"), label=f"response {number}")[
+            "response"
+        ]
+        texels, terms = response.shape[1:]
+        padded = np.zeros((shared_size(len(vertex)), terms, texels + count), response.dtype)
+        padded[: len(vertex), :, :texels] = response.swapaxes(1, 2)
         if lamps is not None:
             padded[: len(vertex), :, texels:] = _to_lamps(lamps, basis, vertex)
         result.append(padded)
@@ -300,12 +302,12 @@ def _second(
         brought = np.concatenate([job.bring(member[cluster]) for cluster in sample])
         if _rms(brought) < least:
             return None, brought
-    found = visibility.blocks.compute(job, run.within("clusters_2"), label="bounce 2")
-    weight, lamp = found["weight"].reshape(*member.shape, -1), None
+    blocks = visibility.blocks.compute(job, run.within("clusters_2"), label="bounce 2")
+    weight, lamp = blocks["weight"].reshape(*member.shape, -1), None
     if job.lamps:
-        weight = np.concatenate([weight, found["lamp_weight"].reshape(*member.shape, -1)], -1)
-        lamp = jax.device_put(found["lamp"])
-    return SecondBounce(*map(jax.device_put, (weight, found["core"], found["error"])), lamp=lamp), found["white"]
+        weight = np.concatenate([weight, blocks["lamp_weight"].reshape(*member.shape, -1)], -1)
+        lamp = jax.device_put(blocks["lamp"])
+    return SecondBounce(*map(jax.device_put, (weight, blocks["core"], blocks["error"])), lamp=lamp), blocks["white"]
 
 
 def _white(factor: Array, channel: Array | None) -> np.ndarray:

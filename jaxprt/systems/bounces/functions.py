@@ -65,12 +65,12 @@ def shared(
     Raises:
         ValueError: A BRDF is negative or not finite.
     """
-    found, size = _evened(reflected.reflect(brdfs, None, resolution=resolution))
-    smooth, colors = _smoothed(found), found.tensor.shape[1]
-    kinds = min(smooth.shape[1], len(found.area))
-    ranks = (min(functions, len(smooth)), kinds, min(terms, found.tensor.shape[3]))
+    light, size = _evened(reflected.reflect(brdfs, None, resolution=resolution))
+    smooth, colors = _smoothed(light), light.tensor.shape[1]
+    kinds = min(smooth.shape[1], len(light.area))
+    ranks = (min(functions, len(smooth)), kinds, min(terms, light.tensor.shape[3]))
     least = tucker.orient(tucker.truncated(smooth, ranks=ranks))
-    view, light = _maps(found, least)
+    view, light = _maps(light, least)
     along = _projected(smooth, least)
     error = _missed(smooth, along, least)
     weight = along.reshape(len(brdfs), colors, -1) * size[:, None, None]
@@ -83,34 +83,34 @@ def shared(
 
 
 @jit
-def _evened(found: Reflected) -> tuple[Reflected, Float[Array, " m"]]:
+def _evened(light: Reflected) -> tuple[Reflected, Float[Array, " m"]]:
     """The reflected light of each BRDF, divided by its norm, and the norms."""
-    sent = _smoothed(found).reshape(len(found.tensor), -1)
+    sent = _smoothed(light).reshape(len(light.tensor), -1)
     size = jnp.sqrt(jnp.sum(sent**2, 1))
     size = jnp.where(size > 0, size, 1)
-    return found._replace(tensor=found.tensor / size[:, None, None, None]), size
+    return light._replace(tensor=light.tensor / size[:, None, None, None]), size
 
 
 @jit
-def _smoothed(found: Reflected) -> Float[Array, "m s b"]:
+def _smoothed(light: Reflected) -> Float[Array, "m s b"]:
     """The light that each BRDF and color reflects, as harmonics of the view."""
-    seen = harmonics.evaluate(found.direction, degree=_SMOOTH) * found.area[:, None]
-    return tucker.multiply(found.tensor.reshape(-1, *found.tensor.shape[2:]), seen, mode=1)
+    seen = harmonics.evaluate(light.direction, degree=_SMOOTH) * light.area[:, None]
+    return tucker.multiply(light.tensor.reshape(-1, *light.tensor.shape[2:]), seen, mode=1)
 
 
 @jit
-def _maps(found: Reflected, least: tucker.Tucker) -> tuple[Array, Array]:
+def _maps(light: Reflected, least: tucker.Tucker) -> tuple[Array, Array]:
     """View maps of each function and term, and light maps, of a decomposition."""
     along, _, across = least.factor
-    flat = found.tensor.reshape(-1, *found.tensor.shape[2:])
+    flat = light.tensor.reshape(-1, *light.tensor.shape[2:])
     view = tucker.multiply(tucker.multiply(flat, across, mode=2), along, mode=0)  # [h, d, k]
     # Light maps carry the size of each term, so that view factors have a mean square of about one.
-    square = jnp.einsum("hdk,d->k", view**2, found.area) / (jnp.sum(found.area) * len(flat))
+    square = jnp.einsum("hdk,d->k", view**2, light.area) / (jnp.sum(light.area) * len(flat))
     size = jnp.where(square > 0, jnp.sqrt(square), 1)
-    edge = math.isqrt(len(found.area))
+    edge = math.isqrt(len(light.area))
     return (
         jnp.moveaxis(view / size, 1, 2).reshape(-1, edge, edge),
-        (size[:, None] * (across.T @ found.to_map)).reshape(-1, edge, edge),
+        (size[:, None] * (across.T @ light.to_map)).reshape(-1, edge, edge),
     )
 
 
@@ -118,9 +118,9 @@ def _maps(found: Reflected, least: tucker.Tucker) -> tuple[Array, Array]:
 def _projected(smooth: Float[Array, "n s b"], least: tucker.Tucker) -> Float[Array, "n h"]:
     """Least-squares weights of the functions for the light that BRDFs reflect."""
     core = least.core.reshape(len(least.core), -1)
-    met = tucker.multiply(tucker.multiply(smooth, least.factor[2], mode=2), least.factor[1], mode=1)
+    sent = tucker.multiply(tucker.multiply(smooth, least.factor[2], mode=2), least.factor[1], mode=1)
     square = jnp.linalg.pinv(core @ core.T, rtol=_RANK**2, hermitian=True)
-    return met.reshape(len(smooth), -1) @ core.T @ square
+    return sent.reshape(len(smooth), -1) @ core.T @ square
 
 
 @jit
@@ -161,8 +161,8 @@ def project(basis: SeparableBrdf, *, degree: int) -> Float[Array, "s k"]:
     """
     up = jnp.zeros(3, basis.light_map.dtype).at[2].set(1)
     direction, area = hemisphere.arcs(up, rings=_RINGS, sectors=_SECTORS)
-    met = basis.light(direction)[..., 0] * (direction[:, 2] * area)[:, None]
-    return harmonics.evaluate(direction, degree=degree).T @ met
+    factor = basis.light(direction)[..., 0] * (direction[:, 2] * area)[:, None]
+    return harmonics.evaluate(direction, degree=degree).T @ factor
 
 
 @jit
@@ -171,8 +171,8 @@ def albedo(basis: SeparableBrdf) -> Float[Array, " p"]:
     up = jnp.zeros(3, basis.light_map.dtype).at[2].set(1)
     direction, area = hemisphere.arcs(up, rings=_RINGS, sectors=_SECTORS)
     flux = direction[:, 2] * area
-    met = flux @ basis.light(direction)[..., 0]
-    return jnp.einsum("d,dkp,k->p", flux / np.pi, basis.view(direction), met)
+    response = flux @ basis.light(direction)[..., 0]
+    return jnp.einsum("d,dkp,k->p", flux / np.pi, basis.view(direction), response)
 
 
 def fixed_weights(brdf: SeparableBrdf) -> Float[Array, "p c"]:
@@ -185,7 +185,7 @@ def fixed_weights(brdf: SeparableBrdf) -> Float[Array, "p c"]:
         raise ValueError(
             f"light maps must have one channel that all colors share, got {brdf.light_map.shape[-1]} channels"
         )
-    light, view = (np.asarray(each, np.float64) for each in (brdf.light_map, brdf.view_map))
+    light, view = (np.asarray(maps, np.float64) for maps in (brdf.light_map, brdf.view_map))
     rows = view * np.sqrt(np.mean(light**2, (1, 2, 3), keepdims=True))
     _, value, axis = np.linalg.svd(rows.reshape(-1, brdf.view_map.shape[-1]), full_matrices=False)
     # Fix the signs, which rounding would decide otherwise.

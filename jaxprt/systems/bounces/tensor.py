@@ -97,7 +97,7 @@ class TransferTensor(eqx.Module):
     def nbytes(self) -> int:
         """Bytes of the tensors."""
         held = self.weight, self.core, self.mode, self.second, self.patches, self.lamp
-        return sum(each.nbytes for each in jax.tree.leaves(held))
+        return sum(leaf.nbytes for leaf in jax.tree.leaves(held))
 
 
 def twice(components: int) -> int:
@@ -157,12 +157,12 @@ def collect(
     if lamp is None and tensor.lamps:
         lamp = jnp.zeros((tensor.lamps, 1), weight.dtype)
     # Multiply and sum along the last axes: for an einsum, XLA on CPUs would transpose the large operands first.
-    met, row, matte = jnp.sum(light.first * weight.T[:, None, None], -1), tensor.weight, light.matte
+    sent, row, matte = jnp.sum(light.first * weight.T[:, None, None], -1), tensor.weight, light.matte
     if lamp is not None and tensor.lamp is not None:
-        met = _beside(met, jnp.einsum("ginsq,iqc->gcns", tensor.lamp.astype(met.dtype), lamp[:, None] * weight))
+        sent = _beside(sent, jnp.einsum("ginsq,iqc->gcns", tensor.lamp.astype(sent.dtype), lamp[:, None] * weight))
         if matte is not None and tensor.patches is not None and tensor.patches.lamp is not None:
             matte = matte + tensor.patches.lamp @ lamp
-    once, twice = met, None
+    once, twice = sent, None
     if light.second is not None and tensor.second is not None:
         both = weight.T[:, :, None] * weight.T[:, None]
         twice = jnp.sum(light.second * both[:, None, None], (-2, -1))
@@ -170,9 +170,9 @@ def collect(
             core = tensor.second.lamp.astype(twice.dtype)
             paths = lamp[:, None, None] * weight[:, None] * weight  # [i q p c]
             twice = _beside(twice, jnp.einsum("giosqp,iqpc->gcos", core, paths))
-        met, row = _beside(met, twice), jnp.concatenate([row, tensor.second.weight], -1)
-    clusters, colors, components, harmonic = met.shape
-    rows = row @ jnp.moveaxis(met, 2, 1).reshape(clusters, components, colors * harmonic)
+        sent, row = _beside(sent, twice), jnp.concatenate([row, tensor.second.weight], -1)
+    clusters, colors, components, harmonic = sent.shape
+    rows = row @ jnp.moveaxis(sent, 2, 1).reshape(clusters, components, colors * harmonic)
     whole = rows.reshape(-1, colors, harmonic)[tensor.place].transpose(2, 1, 0)
     no_more = tensor.patches is None or twice is None or tensor.patches.bounces == 2
     if matte is None or (change is None and no_more):

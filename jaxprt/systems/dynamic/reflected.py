@@ -60,13 +60,13 @@ def reflect(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int
     # BRDFs of one model are evaluated together, others one by one.
     parts = [(together, np.arange(len(brdfs)))]
     if together is None:
-        parts = [(_stack((grid.as_argument(each),)), np.array([n])) for n, each in enumerate(brdfs)]
+        parts = [(_stack((grid.as_argument(brdf),)), np.array([n])) for n, brdf in enumerate(brdfs)]
     # Isotropic BRDFs need only one view at each height.
     turned = all(map(is_isotropic, brdfs))
     view, back = _heights(direction) if turned else (direction, np.arange(len(direction)))
-    found = [_reflected(part, lobe, number, view) for part, number in parts]
-    check_values([least for _, _, least in found])
-    tensor, square = (np.concatenate([np.asarray(each[part]) for each in found]) for part in (0, 1))
+    rows = [_reflected(part, lobe, number, view) for part, number in parts]
+    check_values([least for _, _, least in rows])
+    tensor, square = (np.concatenate([np.asarray(row[part]) for row in rows]) for part in (0, 1))
     tensor = _turn(tensor, back, direction) if turned else jnp.asarray(tensor)
     whole = jnp.asarray(np.sum(square[:, :, back] * area))
     return Reflected(tensor, _to_map(direction, _dual()), direction, area, whole)
@@ -74,7 +74,7 @@ def reflect(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int
 
 def check_values(least: Sequence[Float[Array, " _"]]) -> None:
     """Refuses BRDFs by their minimum values, which are negative or NaN for a BRDF that is negative or not finite."""
-    value = np.concatenate([np.asarray(each) for each in least])
+    value = np.concatenate([np.asarray(values) for values in least])
     wrong = np.flatnonzero(~(value >= 0))
     if wrong.size:
         raise ValueError(
@@ -85,10 +85,12 @@ def check_values(least: Sequence[Float[Array, " _"]]) -> None:
 
 def stacked(brdfs: Sequence[Callable]) -> Callable | None:
     """One model whose parameters have a leading axis along the set; None if the BRDFs are not of one model."""
-    leaves = [jax.tree.leaves(each) for each in brdfs]
-    if not leaves[0] or not all(eqx.is_inexact_array(leaf) for own in leaves for leaf in own):
+    leaves = [jax.tree.leaves(brdf) for brdf in brdfs]
+    if not leaves[0] or not all(eqx.is_inexact_array(leaf) for arrays in leaves for leaf in arrays):
         return None
-    kinds = {(jax.tree.structure(each), tuple(map(jnp.shape, own))) for each, own in zip(brdfs, leaves, strict=True)}
+    kinds = {
+        (jax.tree.structure(brdf), tuple(map(jnp.shape, arrays))) for brdf, arrays in zip(brdfs, leaves, strict=True)
+    }
     if len(kinds) > 1:
         return None
     return _stack(tuple(brdfs))
@@ -112,7 +114,7 @@ def _reflected(
             return value, value if lobe is None else value - _one(lobe, number).lookup(wo[None]).evaluate(wi).T, least
 
         whole, rest, least = jax.vmap(values)(number, brdf)
-        whole, rest = (jnp.einsum("mdc,bd->mcb", each, light) for each in (whole, rest))
+        whole, rest = (jnp.einsum("mdc,bd->mcb", value, light) for value in (whole, rest))
         return rest, jnp.sum(whole**2, -1), least
 
     rest, square, least = jax.lax.map(row, view)
@@ -147,7 +149,7 @@ def _heights(direction: Array) -> tuple[Array, np.ndarray]:
 def _turn(tensor: Float[ArrayLike, "m c h b"], back: ArrayLike, direction: Float[Array, "d 3"]) -> Array:
     """Rotates the harmonics reflected to views in the xz plane about the normal, to the azimuth of each view."""
     azimuth = jnp.arctan2(direction[:, 1], direction[:, 0])
-    order = np.concatenate([np.arange(-each, each + 1) for each in range(DEGREE + 1)])
+    order = np.concatenate([np.arange(-band, band + 1) for band in range(DEGREE + 1)])
     opposite = np.arange(len(order)) - 2 * order
     angle = azimuth[:, None] * order
     tensor = jnp.asarray(tensor)[:, :, back]

@@ -119,9 +119,9 @@ class DynamicBrdf(eqx.Module):
         Raises:
             ValueError: The number of parameters differs from the table's.
         """
-        own = self.lobe.at(*parameter)
+        lobe = self.lobe.at(*parameter)
         along = self._along([jnp.asarray(value).reshape(1) for value in parameter])[..., 0]
-        return DynamicBrdf(own, self.core, along.T, self.view_map, self.light_map, self.error)
+        return DynamicBrdf(lobe, self.core, along.T, self.view_map, self.light_map, self.error)
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b k"]:
         """Value in 1/sr of each channel, reconstructed. It is zero below the horizon."""
