@@ -28,7 +28,8 @@ from jaxprt.scene.points import Points
 from jaxprt.sphere import directions
 from jaxprt.systems import standard
 from jaxprt.systems.protocol import Blend
-from jaxprt.systems.standard import LayeredTable, RoughnessFamily, StandardTable
+from jaxprt.systems.standard import LayeredTable, StandardTable
+from jaxprt.systems.standard.families import RoughnessFamily
 
 _STEP = 1.5  # largest ratio of neighboring tabulated roughnesses
 _TINY = 1e-12

@@ -172,7 +172,7 @@ class Harmonics(Recipe):
 
     def takes(self, table: StandardTable) -> bool:
         """Whether a table of this degree is shipped."""
-        return self.degree <= standard.DEGREE
+        return self.degree <= standard.tables.DEGREE
 
     def make(self, shading: Shading, target: Target, *, vertices: int | None = None) -> System:
         """Precomputes the system of all vertices of the shading's mesh, padded to a number of vertices."""
@@ -306,7 +306,7 @@ class Dynamic(Recipe):
     """
 
     lobes: int = 12
-    ranks: tuple[int, int, int] | None = eqx.field(default=standard.RANKS, converter=lambda x: x and tuple(x))
+    ranks: tuple[int, int, int] | None = eqx.field(default=standard.tables.RANKS, converter=lambda x: x and tuple(x))
     components: int = 24
     modes: int = 128
     keep: int = 1024

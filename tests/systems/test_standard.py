@@ -84,7 +84,7 @@ def shading(table, place, weight):
 
 @EVERY
 def test_reading_compiles_no_program(table, caplog):
-    standard.forget()
+    standard.tables.forget()
     with caplog.at_level(logging.DEBUG, logger="jax"), jax.log_compiles(True):
         table.lobes()
         table.harmonics(2)
@@ -101,7 +101,7 @@ def test_reading_compiles_no_program(table, caplog):
 
 @EVERY
 def test_a_table_is_read_once_and_not_traced_when_it_is_read_inside_jit(table):
-    standard.forget()
+    standard.tables.forget()
 
     @jax.jit
     def peak(place):
@@ -270,7 +270,7 @@ def test_other_numbers_of_lobes_are_fitted_and_kept(monkeypatch):
     for _ in range(2):
         METALLIC_ROUGHNESS.lobes(5)
     assert asked == [5]
-    standard.forget()
+    standard.tables.forget()
 
 
 def test_impossible_sizes_are_refused():
