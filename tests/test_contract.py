@@ -655,7 +655,9 @@ EXAMPLES = {
     "systems.bounces.functions.project": example(lambda draw: call(draw.separable()), degree=2),
     "benchmarks.published.lobes.BrdfSet": example(
         lambda draw: call(
-            BrdfSet.of([brdf.Lambert(draw.uniform(1)), brdf.Lambert(draw.uniform(1))]), draw.upper(5), draw.upper(5)
+            BrdfSet.of([brdf.Phong(draw.uniform(1), draw.uniform(1), exponent) for exponent in (4.0, 9.0)]),
+            draw.upper(5),
+            draw.upper(5),
         ),
     ),
     "benchmarks.published.lobes.Remainder": example(

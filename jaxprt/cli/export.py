@@ -32,7 +32,9 @@ _KINDS = {".html": "page", ".glb": "baked", ".json": "probes"}
     metavar="FILE",
     help="File to write: *.html, *.glb or *.json. May be given several times.",
 )
-@options.systems(("lobe", "harmonic"), default="lobe", words="Of the page and the baked scene.  [default: lobe]")
+@options.systems(
+    ("lobe", "harmonic", "dynamic"), default="lobe", words="Of the page and the baked scene.  [default: lobe]"
+)
 @option(
     "--bounces",
     group="System",

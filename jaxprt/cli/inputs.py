@@ -84,11 +84,13 @@ def parse(text: str) -> Callable | TexturedMaterial:
 
 
 def parameters(name: str) -> dict[str, float | None]:
-    """Numeric parameters of a model with their defaults; None for required ones."""
+    """Parameters of a model that commands can set, those of one number, with their defaults; None for required ones."""
     result = {}
     for field in inspect.signature(registry.materials()[name]).parameters.values():
-        if not field.name.endswith("_texture") and not isinstance(field.default, str):
-            result[field.name] = None if field.default is inspect.Parameter.empty else float(field.default)
+        if field.default is inspect.Parameter.empty:
+            result[field.name] = None
+        elif np.ndim(field.default) == 0 and np.asarray(field.default).dtype.kind in "biuf":
+            result[field.name] = float(field.default)
     return result
 
 

@@ -186,8 +186,11 @@ def load_folder(path: Path) -> Any:
             f"{path} must be a folder that jaxprt.files.save wrote, got one that cannot be read: it is damaged, {error}"
         ) from error
     if header.get("format") != FORMAT:
-        came = str(header.get("format", "another kind of folder"))[:80]
-        raise ValueError(f"{path} must be a folder that jaxprt.files.save wrote, got {came}, or it is damaged")
+        came = str(header.get("format", "another kind of file or folder"))[:80]
+        raise ValueError(
+            f"{path} must be a folder that jaxprt.files.save wrote, got {came}, or it is damaged; a folder of "
+            "precomputed data is read by jaxprt.precompute(scene, path=)"
+        )
     version, text = header.get("version"), header.get("content")
     if version != VERSION or type(version) is not int:
         newer = isinstance(version, int) and version > VERSION

@@ -66,7 +66,8 @@ class LampLight:
         few = sum(lamp >= 0 for lamp in self.stage.lamp) <= _MANY
         pieces = _FINE if smooth and few else _COARSE
         if pieces not in self._places:
-            self._places[pieces] = places(self._sources, np.asarray(self.stage.power), pieces=pieces)
+            with compile_time(self.stage.whole):  # Derivatives trace the shading of a row.
+                self._places[pieces] = places(self._sources, np.asarray(self.stage.power), pieces=pieces)
         return self._places[pieces]
 
     def row(self, number: int, index: Int[Array | np.ndarray, " p"], on_group: Points) -> LampTransport:

@@ -541,7 +541,7 @@ class RelitScene(System):
         if picture.shape[:2] != (camera.height, camera.width):
             raise ValueError(
                 f"the picture must have the camera's {camera.height} x {camera.width} pixels (rows x columns), got "
-                f"{picture.shape[0]} x {picture.shape[1]}"
+                f"{picture.shape[0]} x {picture.shape[1]}: give the camera of the picture"
             )
         picture = jnp.broadcast_to(picture, (*picture.shape[:2], 3))
         coverage = self.coverage(camera)

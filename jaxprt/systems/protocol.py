@@ -167,8 +167,8 @@ class System(eqx.Module):
             ValueError: A page cannot show the system. By default it can show none.
         """
         raise ValueError(
-            f"{what} must be ideally diffuse or made by the system 'lobe', 'dynamic' or 'harmonic' to be exported, got "
-            f"{type(self).__name__}, which has no method `exported`"
+            f"{what} must have a system with the method `exported` to be exported, as 'lobe', 'dynamic', 'harmonic' "
+            f"and those of ideally diffuse parts, got {type(self).__name__}"
         )
 
     @property

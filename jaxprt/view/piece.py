@@ -7,6 +7,7 @@ import json
 import os
 import pathlib
 import struct
+import warnings
 import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -365,17 +366,16 @@ def export(
     bytes. Other parts use lobes and averaged visibility. All are stored as finely as `most` permits. If they fit, the
     brightest texels of the light are summed one by one on the parts that support it. As in the viewer, the user can
     rotate or replace the light, add lamps, and change materials that are constant over a part. A Radiance HDR file that
-    is dropped on the page becomes a light. Clear coats and sheens are left out, with a warning.
+    is dropped on the page becomes a light. Bounces, lamps, clear coats and sheens are left out, with a warning.
 
     Args:
-        scene: The result of `jaxprt.precompute`, with the systems "lobe" and "harmonic".
+        scene: The result of `jaxprt.precompute`, with systems that say what a page holds of them, such as "lobe".
         path: The file, `*.html`.
         environments: Dictionary from names to lights; the scene's own or the two embedded ones if None.
         most: Largest size of the file in bytes.
 
     Returns:
-        A description of the page, with its size and its error against the scene. If the scene has bounces, the error
-        includes that they are missing in the page, and so it does with clear coats and sheens.
+        A description of the page, with its size and its error against the scene, which includes what is left out.
 
     Raises:
         TypeError: `scene` is not a relit scene, `path` is not a path, `most` is not a number, or `environments` holds
@@ -388,6 +388,9 @@ def export(
     require.number("most", most, 1.0)
     path = outputs.target(path, ".html")
     scene = scene.centered()
+    absent = [name for name, light in (("bounces", scene.bounces), ("lamps", scene.lamps)) if light is not None]
+    if absent:
+        warnings.warn(f"the page has the light of environments alone, without {' and '.join(absent)}", stacklevel=2)
     session = Session(scene, environments=environments)
     lights = dict(zip(session.stages.name, session.stages.lights, strict=True))
     whole = PageScene.of(scene)

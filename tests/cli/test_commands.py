@@ -149,6 +149,10 @@ def test_info_says_what_is_left_out_and_what_folders_hold(place, capsys):
     saved, store = json.loads(capsys.readouterr().out)
     assert saved["bytes"] == sum(each.stat().st_size for each in (place / "kept" / "light").iterdir())
     assert store["finished"] == store["blocks"] > 0
+    with (place / "kept" / "seen.prt" / "checksum.npy").open("r+b") as file:
+        file.truncate(file.seek(0, 2) - 4)  # of a run that was stopped before its last block
+    assert main("info", place / "kept" / "seen.prt", "--json") == 0
+    assert json.loads(capsys.readouterr().out)[0]["finished"] == store["blocks"] - 1
     np.save(place / "kept" / "seen.prt" / "checksum.npy", np.zeros(store["blocks"], np.uint32))
     assert main("info", place / "kept" / "seen.prt", "--json") == 0
     assert json.loads(capsys.readouterr().out)[0]["finished"] == 0

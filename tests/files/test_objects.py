@@ -282,7 +282,7 @@ def test_damage_is_found_and_told(tmp_path, scene):
     with pytest.raises(FileNotFoundError, match="there is no such folder"):
         prt.files.load(tmp_path / ("a" * 300))
     (tmp_path / "other").mkdir()
-    with pytest.raises(ValueError, match="got another kind of folder"):
+    with pytest.raises(ValueError, match="got another kind of file or folder"):
         prt.files.load(tmp_path / "other")
 
 

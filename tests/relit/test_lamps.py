@@ -1,5 +1,6 @@
 """Lamps of scenes: parts that emit, and point lights, free in color and strength."""
 
+import dataclasses
 import functools
 
 import jax
@@ -86,6 +87,19 @@ def test_pictures_have_the_light_of_lamps(close):
     dim = {"bulb": PointLight("bulb", BULB.position, 0.25)}
     lamp = relit().picture(DARK, samples=1, materials=dim)
     assert np.linalg.norm(np.asarray(lamp) - picture) > 0.05 * np.linalg.norm(picture)
+
+
+def test_pictures_have_the_derivatives_of_their_lamps():
+    """By the light of the panel and by the color of the floor; a picture is linear in the first."""
+
+    def brightness(emitted, base):
+        panel = TexturedMaterial(**BLACK, emissive=emitted * jnp.array(WARM))
+        clay = dataclasses.replace(scene().parts[0].material, base_color=base * jnp.array([0.5, 0.6, 0.7]))
+        return jnp.mean(relit().picture(DARK, samples=1, materials={"panel": panel, "floor": clay}))
+
+    slopes = jax.grad(brightness, (0, 1))(1.0, 1.0)
+    steps = brightness(2.0, 1.0) - brightness(1.0, 1.0), (brightness(1.0, 1.1) - brightness(1.0, 0.9)) / 0.2
+    np.testing.assert_allclose(slopes, steps, rtol=1e-3)
 
 
 def test_shadows_between_vertices_are_at_their_pixels():

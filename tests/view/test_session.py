@@ -182,7 +182,7 @@ def test_a_picture_under_way_is_given_up_within_a_row_of_the_next_look(session, 
         if count in moved:
             assert session.answer(look | moved[count]).content["kind"] == "color"
 
-    rows = counted(monkeypatch, pictures, "lit", move)
+    rows = counted(monkeypatch, pictures, "radiance", move)
     whole = session.answer(asked)
     assert whole.content["kind"] == "still"  # another viewer's moves leave it alone
     count = len(rows)

@@ -54,7 +54,7 @@ class _Layer(NamedTuple):
     loss: Callable[[Float[np.ndarray, " v"], Float[np.ndarray, " n"]], Float[np.ndarray, "n v"]]
     reflects: bool
 
-    def lobe_factor(self, loss: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    def lobe_factor(self, loss: Float[np.ndarray, "..."] | np.floating) -> Float[np.ndarray, "..."] | np.floating:
         """Factor of the lobe of the table for the loss of what is under it."""
         return loss if self.reflects else np.ones_like(loss)
 
