@@ -19,6 +19,8 @@ from jaxprt.view import messages, stages
 from jaxprt.view.piece import scene_content
 from jaxprt.view.reduced import PageScene
 
+pytestmark = pytest.mark.filterwarnings("ignore:the page has the light of environments alone, without bounces")
+
 SHOWN = 'mount(document.getElementById("viewer"), answers(content, buffers));'
 ASKED = """async (message) => {
   const { content, buffers } = await window.ask(message, message.file ? [Uint8Array.from(message.file).buffer] : []);
@@ -301,6 +303,11 @@ def test_what_a_page_does_not_have_is_refused(systems, tmp_path):
     refused(skewed, "have a BRDF that is symmetric about the plane of the view")
     with pytest.raises(ValueError, match=r"path must end in \.html, .* got '.*a\.htm'"):
         view.export(systems["lobes"], tmp_path / "a.htm")
+
+
+def test_pages_say_that_bounces_stay_behind(systems, tmp_path):
+    with pytest.warns(UserWarning, match="the page has the light of environments alone, without bounces"):
+        view.export(systems["lobes"], tmp_path / "a.html", environments={"gray": Environment(np.ones((6, 8, 8, 1)))})
 
 
 def test_environments_of_gray_are_lights_too(systems, tmp_path):
