@@ -85,7 +85,7 @@ class Figures:
 
     def camera(self, made: Made, **options: Any) -> Camera:
         """The camera of a scene."""
-        return paper_scenes.camera_of(made, edge=self.edge, **options)
+        return paper_scenes.camera_of(made.recipe, made.scene.mesh, edge=self.edge, **options)
 
     def drawn(
         self,

@@ -44,7 +44,7 @@ from jaxprt.brdf import BlinnPhong, CookTorrance
 from jaxprt.image import render
 from jaxprt.relit import Dynamic, paths
 from jaxprt.relit.groups import joined_mesh
-from jaxprt.scene import Camera, Environment, TexturedMaterial, builtin, load_environment
+from jaxprt.scene import Camera, Environment, Mesh, TexturedMaterial, builtin, load_environment
 from jaxprt.scene.environment import rotate
 from jaxprt.scene.mesh import bounds, split
 
@@ -122,8 +122,8 @@ def prepare(name: str, *, quick: bool = False, store: pathlib.Path | None = None
         {"bounces": BOUNCES, "direct": 16, **options} if quick else {"bounces": BOUNCES, **recipe.options, **options}
     )
     count, size, path = wanted.pop("bounces"), wanted.pop("direct", SIZE), store and store / name
-    parts = []
-    for number, mesh in enumerate(split(recipe.mesh(quick))):
+    parts, whole = [], recipe.mesh(quick)
+    for number, mesh in enumerate(split(whole)):
         free = number in recipe.free
         material = model(recipe.space, recipe.free[number]) if free else matte(recipe.fixed[number])
         parts.append(prt.Part(str(number), mesh, material))
@@ -132,7 +132,8 @@ def prepare(name: str, *, quick: bool = False, store: pathlib.Path | None = None
     try:
         options = {"refine": False, "size": size, "rays": 0, "progress": False, "path": path and path / f"direct{size}"}
         system = Dynamic(lobes=4, ranks=None) if quick else Dynamic()
-        scene = prt.precompute(prt.Scene(parts), system=system, bounces=1 if wanted else count, **options)
+        scene = prt.Scene(parts, [camera_of(recipe, whole)])
+        scene = prt.precompute(scene, system=system, bounces=1 if wanted else count, **options)
         if wanted:
             scene = with_transfer(scene, path and path / marks, bounces=count, **wanted)
     finally:
@@ -244,7 +245,7 @@ def _figures(row: Published) -> list[str]:
 def frames(made: Made, quick: bool) -> Iterator[tuple[str, Callable[[], jax.Array]]]:
     """Kind and function of each frame: every call has another view, other materials, another light."""
     edge = 32 if quick else EDGE
-    cameras = [camera_of(made, edge=edge, turn=turn) for turn in (0.0, 0.15, 0.3)]
+    cameras = [camera_of(made.recipe, made.scene.mesh, edge=edge, turn=turn) for turn in (0.0, 0.15, 0.3)]
     lights = [turned(light_of(made), turn) for turn in (0.0, 0.7, 1.4)]
     materials = [made.materials(_darker(made, amount)) for amount in (1.0, 0.8, 0.6)]
     system, count = made.scene, itertools.count()
@@ -286,10 +287,10 @@ def turned(light: Environment, turn: float) -> Environment:
     return rotate(light, jnp.asarray(about)) if turn else light
 
 
-def camera_of(made: Made, *, edge: int = EDGE, turn: float = 0.0) -> Camera:
-    """The camera of a scene, turned about the vertical axis through what it looks at."""
-    low, high = bounds(made.scene.mesh)
-    diagonal, (eye, target, angle) = float(np.linalg.norm(high - low)), made.recipe.camera
+def camera_of(recipe: Recipe, mesh: Mesh, *, edge: int = EDGE, turn: float = 0.0) -> Camera:
+    """The camera of a scene with a mesh, turned about the vertical axis through what it looks at."""
+    low, high = bounds(mesh)
+    diagonal, (eye, target, angle) = float(np.linalg.norm(high - low)), recipe.camera
     middle = (low + high) / 2 + diagonal * np.asarray(target)
     away = diagonal * (np.asarray(eye) - np.asarray(target))
     cosine, sine = np.cos(turn), np.sin(turn)
