@@ -313,9 +313,12 @@ class Stage(eqx.Module):
         return jnp.asarray(flag)[points.corner[0]]
 
     def blend(self, number: int, points: Points, on_group: Points) -> tuple[Blend | None, Points]:
-        """Weights of the channels of a group's BRDF at points of the scene, which are `on_group` on the group.
+        """Weights of the channels of a group's BRDF at some points, and the points with the normals of normal maps.
 
-        The second result is `on_group` with the normals of normal maps.
+        Args:
+            number: Index of the group.
+            points: The points in the scene.
+            on_group: The same points on the group, which the second result is made of.
         """
         look = look_at(self.table, self.rough, points)
         with compile_time(look, on_group, self.fixed[number], self.surfaces[number].scale):

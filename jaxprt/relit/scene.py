@@ -737,7 +737,7 @@ def traits(shading: Shading, surface: Surface) -> tuple[float, int, bool]:
 
     Args:
         shading: The part with its material.
-        surface: Its group.
+        surface: The group that the part belongs to.
     """
     size = surface.system.texel_edge or _TEXELS
     # Powers of two, so that few programs are compiled for parts of different roughness.

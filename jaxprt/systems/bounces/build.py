@@ -46,8 +46,8 @@ def precompute(
 ) -> TransferTensor:
     """Traces reflected light to every vertex, and compresses it into a transfer tensor.
 
-    Memory during precomputation: 24 edge^2 bytes for each vertex and light factor of its region; afterwards, for two
-    bounces, 96 bytes for each vertex, light factor and function.
+    Memory during precomputation: 24 edge^2 + 6 modes bytes for each vertex and light factor of its region; afterwards,
+    for two bounces, 96 bytes for each vertex, light factor and function.
 
     Args:
         mesh: The whole scene, which reflects light onto itself.

@@ -95,20 +95,20 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
 
     @property
     def spectrum(self) -> tuple[np.ndarray, np.ndarray]:
-        """Matrix from the columns of the environment's light to ones that matter alike, and its inverse."""
+        """Matrix [l l] from the columns of the environment's light to ones that matter alike, and its inverse."""
         raise NotImplementedError
 
     @property
     def uniform(self) -> np.ndarray:
-        """Columns of the environment's light under which the worth of a bounce is estimated."""
+        """Columns [l] of the environment's light under which the worth of a bounce is estimated."""
         raise NotImplementedError
 
     @functools.cached_property
     def reduced(self) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-        """Responses to orthonormal modes of the light, and these modes in columns that matter alike; then lamps.
+        """Responses [v k m] to orthonormal modes m of the light, then lamps; and the modes [l m].
 
-        The modes are principal components of the responses. They are fewer than the columns, and gathering takes as
-        much less time.
+        The modes are principal components of the responses, in columns l that matter alike. They are fewer than these,
+        one and a half times as many as the decomposition keeps, and gathering takes as much less time.
         """
         forward, _ = self.spectrum
         columns, count = len(forward), self.modes * 3 // 2
@@ -121,7 +121,10 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
         return tuple(rows), mode.astype(np.float32)
 
     def _products(self, forward: np.ndarray) -> np.ndarray:
-        """Products of columns of the light, over the responses of some vertices."""
+        """Products [l l] of columns of the light, summed over the responses of a sample of vertices.
+
+        Responses are divided by the size of their vertex's: dim corners of a scene count as bright places do.
+        """
         result = np.zeros((len(forward), len(forward)))
         for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
             strength = np.sqrt(np.mean(np.square(np.asarray(basis.view_map)), (1, 2, 3)))
@@ -141,14 +144,8 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
         divided = visibility.blocks.fingerprint(*(np.asarray(index, np.int64) for index in (self.region, self.member)))
         kinds = self.response[0].shape[2]
         lamps = {"lamps": self.lamps} if self.lamps else {}
-        about = {
-            "kinds": kinds,
-            "maps": maps,
-            "made": divided,
-            "components": self.components,
-            "modes": self.modes,
-        } | lamps
-        return self.made_by(self.system, ALGORITHM, **about)
+        sizes = {"kinds": kinds, "components": self.components, "modes": self.modes} | lamps
+        return self.made_by(self.system, ALGORITHM, maps=maps, made=divided, **sizes)
 
     @property
     def near(self) -> Mapping[str, list[float]]:
@@ -156,8 +153,7 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
         parts = {"white": self.white, "scale": self.scale}
         for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
             parts |= {f"light {number}": basis.light_map, f"view {number}": basis.view_map}
-            rows = response[: len(self.vertices_of(number))]
-            parts |= {f"response {number}": rows.swapaxes(1, 2)}  # The order of axes in stores of earlier releases.
+            parts |= {f"response {number}": response[: len(self.vertices_of(number))]}
         return {**super().near, **{name: sketch(value) for name, value in parts.items()}}
 
     def vertices_of(self, basis: int) -> np.ndarray:
@@ -262,9 +258,11 @@ class TransferJob(_PathJob):
         """One block."""
         light, lamp = self.tensors(self.member[block])
         weight, core, mode, error = compress(light * self.scale, components=self.components, modes=self.modes)
-        mode = self.spectrum[1] @ self.reduced[1] @ mode
-        energy = np.sum(light**2, (0, 1, 2)) + np.sum(lamp**2, (0, 1, 2))
-        rows = {"weight": weight, "core": (core / self.scale)[None], "mode": mode[None], "energy": energy[None]}
+        texels = self.spectrum[1] @ self.reduced[1]  # of the modes of the light
+        reflected = np.tensordot((texels.T @ texels).astype(light.dtype), light, (1, 1)).swapaxes(0, 1)
+        energy = np.sum(light * reflected, (0, 1, 2)) + np.sum(lamp**2, (0, 1, 2))
+        rows = {"weight": weight, "core": (core / self.scale)[None], "mode": (texels @ mode)[None]}
+        rows |= {"energy": energy[None]}
         rows |= {"error": np.array([error]), "white": self.irradiance(light, self.member[block])}
         rows |= self.lamp_rows(lamp, self.scale)
         return {name: np.asarray(row) for name, row in rows.items()}, 0

@@ -221,9 +221,9 @@ def _no_lobes(diffuse: Float[Array, "c *q"], knots: Sequence[np.ndarray]) -> Lob
 
 def _without_irradiance(rest: Reflected) -> tuple[Reflected, Float[Array, "m c d"]]:
     """What is left when the part that is proportional to irradiance is taken out at each view, and that albedo."""
-    one = reflected.reflect([Lambert(1.0)], None, resolution=math.isqrt(len(rest.area))).tensor[0, 0]
-    irradiance = one[np.flatnonzero(np.asarray(rest.area))[0]]
-    base = jnp.matmul(rest.tensor, irradiance, precision="highest") / jnp.vdot(irradiance, irradiance)
+    irradiance = reflected.reflect([Lambert(1.0)], None, resolution=math.isqrt(len(rest.area))).tensor[0, 0]  # [d b]
+    # That of each view by the view's own quadrature, so that its error cancels in the ratio.
+    base = jnp.sum(rest.tensor * irradiance, -1) / jnp.sum(irradiance**2, -1)
     return rest._replace(tensor=rest.tensor - base[..., None] * irradiance), base
 
 

@@ -15,6 +15,7 @@ from jaxprt.scene import Environment, builtin
 from jaxprt.scene.mesh import ground_plane, join, make_mesh
 from jaxprt.sphere import cubemap, directions, haar, harmonics
 from jaxprt.systems.bounces.tensor import LitTransfer
+from jaxprt.systems.harmonic import TransferVector
 from jaxprt.visibility import Run
 
 # Edges of cubemap faces: EDGE divides the light, SIZE the rays between surfaces, SEEN the visibility of the light.
@@ -76,15 +77,22 @@ def test_bounces_under_constant_light_are_those_of_the_harmonic_system():
     cosine = np.pi * np.array([1, 2 / 3, 1 / 4, 0])[[0, *[1] * 3, *[2] * 5, *[3] * 7]]
     at = np.asarray(harmonics.evaluate(mesh.normal, degree=3)) * cosine / np.pi
     plain = harmonic.precompute_diffuse(mesh, degree=0, size=SEEN)
-    options = {"size": SEEN}
-    one, two = (interreflect_diffuse(mesh, plain, albedo, bounces=n, **options) for n in (1, 2))
-    exact = [np.asarray(b.vector - a.vector)[0].T * np.sqrt(4 * np.pi) for a, b in ((plain, one), (one, two))]
-    assert relative(np.einsum("vs,vsc->vc", at, once), exact[0]) < 0.014
-    assert relative(np.einsum("vs,vsc->vc", at, twice), exact[1]) < 0.035  # A quarter of the rays.
-    bright = albedo.max(1, keepdims=True)
-    one, two = (interreflect_diffuse(mesh, plain, bright, bounces=n, **options) for n in (1, 2))
-    brought = [np.asarray(b.vector - a.vector)[0] * np.sqrt(4 * np.pi) for a, b in ((plain, one), (one, two))]
-    assert np.all(np.abs(tensor.worth / np.sqrt(np.mean(np.square(brought), (1, 2))) - 1) < [0.003, 0.03])
+
+    def exact(albedo):
+        """Radiance [c v] of one bounce and of two, the second by rays through faces of half the edge."""
+        one = interreflect_diffuse(mesh, plain, albedo, size=SEEN)
+        first = TransferVector(one.vector - plain.vector, plain.position)
+        both = interreflect_diffuse(mesh, first, albedo, size=SEEN // 2)
+        return [np.asarray(row)[0] * np.sqrt(4 * np.pi) for row in (first.vector, both.vector - first.vector)]
+
+    first, second = exact(albedo)
+    assert relative(np.einsum("vs,vsc->vc", at, once), first.T) < 0.014
+    assert relative(np.einsum("vs,vsc->vc", at, twice), second.T) < 0.018
+    # The rays of the second bounce, a quarter of those of the first, leave 3.4 % of it.
+    finer = [interreflect_diffuse(mesh, plain, albedo, bounces=count, size=SEEN).vector for count in (1, 2)]
+    assert relative(second, np.asarray(finer[1] - finer[0])[0] * np.sqrt(4 * np.pi)) < 0.035
+    brought = [np.sqrt(np.mean(row**2)) for row in exact(albedo.max(1, keepdims=True))]
+    assert np.all(np.abs(tensor.worth / brought - 1) < [0.003, 0.015])
 
 
 def test_two_bounces_are_a_loop_over_rays_of_rays(mesh, brdfs, whole):
@@ -214,8 +222,8 @@ def test_fewer_components_and_modes_err_as_they_say(mesh, brdfs, whole):
     weight = jnp.tile(jnp.diag(bounces.tensor.scales(whole.factor)), texels)
     exact, found = (arriving(each, lamp, weight)[0] for each in (whole, cut))
     assert float(cut.error[0]) > 0.01
-    # Besides, gathering by 36 modes of the light of 96 texels leaves a little.
-    np.testing.assert_allclose(relative(found, exact), float(cut.error[0]), rtol=0.03)
+    # Besides, gathering by 36 modes of the light of 96 texels leaves a little, and never less.
+    assert 0.999 < relative(found, exact) / float(cut.error[0]) < 1.03
 
 
 @pytest.fixture(scope="module")
