@@ -69,34 +69,34 @@ def pair(request):
     return kind, *(prt.precompute(scene(material), **options) for material in (kind.first, kind.other))
 
 
-def off(found, true):
-    return np.linalg.norm(np.asarray(found) - true) / np.linalg.norm(true)
+def off(color, true):
+    return np.linalg.norm(np.asarray(color) - true) / np.linalg.norm(true)
 
 
 def test_a_changed_material_is_that_of_a_scene_made_for_it(pair, light):
     kind, free, alone = pair
-    given, eye = {"ball": kind.other}, free.camera.eye
-    assert off(free.radiance(light, eye=eye, materials=given), alone.radiance(light, eye=eye)) < 0.01
+    materials, eye = {"ball": kind.other}, free.camera.eye
+    assert off(free.radiance(light, eye=eye, materials=materials), alone.radiance(light, eye=eye)) < 0.01
     camera = dataclasses.replace(free.camera, width=48, height=48)
-    assert off(free.picture(light, camera, materials=given), alone.picture(light, camera)) < 0.01
+    assert off(free.picture(light, camera, materials=materials), alone.picture(light, camera)) < 0.01
 
 
 def test_radiance_is_that_of_the_exact_sum(pair, light):
     kind, free, _ = pair
     mesh, direct, eye = free.mesh, free.without_bounces(), free.camera.eye
-    found = direct.radiance(light, eye=eye, materials={"ball": kind.other})[: len(free.scene["ball"].mesh.position)]
+    color = direct.radiance(light, eye=eye, materials={"ball": kind.other})[: len(free.scene["ball"].mesh.position)]
     true = prt.reference.radiance(free.scene["ball"].mesh, kind.other, light, eye=eye, occluder=mesh)
     system = free.surfaces[0].system
     harmonic = isinstance(getattr(system, "system", system), prt.harmonic.HarmonicSystem)
-    assert off(found, np.asarray(true)) < (HARMONIC if harmonic else ERROR)
+    assert off(color, np.asarray(true)) < (HARMONIC if harmonic else ERROR)
 
 
 def test_radiance_is_differentiable_in_the_parameters(pair, light):
     kind, free, _ = pair
 
     def brightness(value):
-        given = {"ball": dataclasses.replace(kind.other, **value)}
-        return jnp.mean(free.radiance(light, eye=free.camera.eye, materials=given) ** 2)
+        materials = {"ball": dataclasses.replace(kind.other, **value)}
+        return jnp.mean(free.radiance(light, eye=free.camera.eye, materials=materials) ** 2)
 
     where = {
         name: jnp.asarray([0.5]) if name == "f0" else jnp.asarray(getattr(kind.other, name)) for name in kind.steps
@@ -130,8 +130,8 @@ def test_a_bounce_carries_the_changed_colors(pair, light):
     bare, first, eye = free.without_bounces(), len(free.scene["ball"].mesh.position), free.camera.eye
 
     def bounced(diffuse):
-        given = {"ball": dataclasses.replace(kind.other, diffuse=jnp.asarray(diffuse), specular=jnp.full(3, 0.05))}
-        whole, direct = (relit.radiance(light, eye=eye, materials=given) for relit in (free, bare))
+        materials = {"ball": dataclasses.replace(kind.other, diffuse=jnp.asarray(diffuse), specular=jnp.full(3, 0.05))}
+        whole, direct = (relit.radiance(light, eye=eye, materials=materials) for relit in (free, bare))
         return np.mean(np.asarray(whole - direct)[first:], 0)
 
     red, blue = bounced([0.8, 0.1, 0.1]), bounced([0.1, 0.1, 0.8])
@@ -151,10 +151,10 @@ def test_the_viewer_changes_lobes_and_colors(pair, light):
     look |= {key: told[key] for key in ("eye", "target", "field_of_view")} | {"stops": None}
     new = {"diffuse": [0.1, 0.3, 0.3], name: float(getattr(kind.other, name)), "f0": 0.9, "specular": [0.5, 0.4, 0.1]}
     reply = session.answer(look | {"materials": {"ball": new}})
-    found = np.frombuffer(reply.buffers[0], "<f2").astype(float).reshape(-1, 3)
+    color = np.frombuffer(reply.buffers[0], "<f2").astype(float).reshape(-1, 3)
     same = {"f0": jnp.asarray([0.9])} if "f0" in kind.steps else {"specular": 0.9 * jnp.asarray(kind.other.specular)}
     true = free.radiance(
         light, eye=jnp.asarray(told["eye"]), materials={"ball": dataclasses.replace(kind.other, **same)}
     )
-    assert off(found, np.asarray(true)) < 2e-3
+    assert off(color, np.asarray(true)) < 2e-3
     assert session.answer(look | {"materials": {"ball": {name: 5e5}}}).content["kind"] == "error"

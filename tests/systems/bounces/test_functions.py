@@ -28,18 +28,18 @@ def sent(members, terms, weight):
     def exact(brdf):
         return smooth @ jax.lax.map(lambda each: brdf(wi, jnp.broadcast_to(each, wi.shape))[:, 0] @ light, wo)
 
-    met = terms.light(wi)[..., 0].T @ light
-    found = jnp.einsum("sd,dkp,mp,kb->msb", smooth, terms.view(wo), weight[:, 0], met)
-    return jnp.stack([exact(each) for each in members]), found
+    arriving = terms.light(wi)[..., 0].T @ light
+    by_functions = jnp.einsum("sd,dkp,mp,kb->msb", smooth, terms.view(wo), weight[:, 0], arriving)
+    return jnp.stack([exact(each) for each in members]), by_functions
 
 
 @pytest.mark.parametrize(("functions", "terms"), [(2, 6), (3, 12)])
 def test_the_error_of_functions_is_that_of_what_they_send(functions, terms):
     """Relative L2 error of the light that each BRDF sends, over all BRDFs."""
     shared, weight = bounces.functions.shared(MEMBERS, functions=functions, terms=terms, resolution=RESOLUTION)
-    exact, found = sent(MEMBERS, shared, weight)
+    exact, by_functions = sent(MEMBERS, shared, weight)
     size = np.linalg.norm(exact, axis=(1, 2))
-    missed = np.linalg.norm(found - exact, axis=(1, 2)) / size
+    missed = np.linalg.norm(by_functions - exact, axis=(1, 2)) / size
     assert float(shared.error) == pytest.approx(np.sqrt(np.mean(missed**2)), rel=0.02)
 
 

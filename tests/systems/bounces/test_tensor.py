@@ -92,7 +92,7 @@ def test_bounces_under_constant_light_are_those_of_the_harmonic_system():
     finer = [interreflect_diffuse(mesh, plain, albedo, bounces=count, size=SEEN).vector for count in (1, 2)]
     assert relative(second, np.asarray(finer[1] - finer[0])[0] * np.sqrt(4 * np.pi)) < 0.035
     brought = [np.sqrt(np.mean(row**2)) for row in exact(albedo.max(1, keepdims=True))]
-    assert np.all(np.abs(tensor.worth / brought - 1) < [0.003, 0.015])
+    assert np.all(np.abs(np.divide(tensor.worth, brought) - 1) < [0.003, 0.015])
 
 
 def test_two_bounces_are_a_loop_over_rays_of_rays(mesh, brdfs, whole):

@@ -76,31 +76,31 @@ def off(found, true):
 
 @pytest.mark.parametrize("roughness", ROUGHNESS)
 def test_radiance_is_that_of_the_exact_sum(system, seen, light, roughness):
-    name, made = system
+    name, dynamic_system = system
     blend = materials(len(seen.position), roughness)
-    assert off(prt.radiance(made, light, eye=EYE, materials=blend), exact(seen, light, blend)) < ERROR[name]
+    assert off(prt.radiance(dynamic_system, light, eye=EYE, materials=blend), exact(seen, light, blend)) < ERROR[name]
 
 
 def test_roughness_may_vary_over_the_surface(system, seen, light):
-    name, made = system
+    name, dynamic_system = system
     roughness = np.random.default_rng(2).uniform(0.3, 1, len(seen.position)).astype(np.float32)
     blend = materials(len(seen.position), roughness)
-    assert off(prt.radiance(made, light, eye=EYE, materials=blend), exact(seen, light, blend)) < ERROR[name]
+    assert off(prt.radiance(dynamic_system, light, eye=EYE, materials=blend), exact(seen, light, blend)) < ERROR[name]
 
 
 def test_bright_texels_take_the_sun_over(seen, light, system):
-    name, made = system
+    name, dynamic_system = system
     sky = np.array(light.radiance)
     sky[4, 3, 3] = 2000.0
     sun = Environment(jnp.asarray(sky))
     blend = materials(len(seen.position), 0.5)
-    whole = bright_texels.BrightTexels(made, seen, METALLIC_ROUGHNESS.family, count=8, samples=4)
+    whole = bright_texels.BrightTexels(dynamic_system, seen, METALLIC_ROUGHNESS.family, count=8, samples=4)
     assert off(prt.radiance(whole, sun, eye=EYE, materials=blend), exact(seen, sun, blend)) < ERROR[name] / 2
 
 
 def test_points_with_a_tilted_normal_reflect_around_it(seen, system):
     """Under a light from everywhere a tilt changes little; mirrored views follow the tilted normal."""
-    _, made = system
+    _, dynamic_system = system
     count = len(seen.position)
     blend = materials(count, 0.5)
     sky = Environment(jnp.ones((6, SIZE, SIZE, 3)))
@@ -109,17 +109,22 @@ def test_points_with_a_tilted_normal_reflect_around_it(seen, system):
     weight[0] = 1
     points = Points(jnp.asarray(corner), jnp.asarray(weight))
     straight = points.tilted(np.asarray(seen.frame[:, 2]))
-    lit = made.shade(made.light(sky))
-    tilted = made.tilted(lit, jnp.asarray(seen.frame[:, 2]))
-    same = made.at(straight)
+    lit = dynamic_system.shade(dynamic_system.light(sky))
+    tilted = dynamic_system.tilted(lit, jnp.asarray(seen.frame[:, 2]))
+    same = dynamic_system.at(straight)
     found = same.combine(tilted, same.view(EYE, blend))
-    np.testing.assert_allclose(found, made.combine(lit, made.view(EYE, blend)), rtol=2e-3, atol=2e-3)
+    np.testing.assert_allclose(
+        found, dynamic_system.combine(lit, dynamic_system.view(EYE, blend)), rtol=2e-3, atol=2e-3
+    )
 
 
 def test_rays_read_its_lobes_widened_and_its_terms_as_they_are(seen, light, system):
-    name, made = system
+    name, dynamic_system = system
     blend, options = materials(len(seen.position), 0.1), {"brdf": METALLIC_ROUGHNESS.family, "count": 8}
-    whole, lobes = (bright_texels.BrightTexels(of, made.transport.pyramid, **options) for of in (made, made.lobe_part))
+    whole, lobes = (
+        bright_texels.BrightTexels(of, dynamic_system.transport.pyramid, **options)
+        for of in (dynamic_system, dynamic_system.lobe_part)
+    )
     sun = Environment(jnp.zeros((6, SIZE, SIZE, 3)).at[2, 8, 8].set(100.0))
 
     def read(of, environment, variance):
@@ -128,8 +133,8 @@ def test_rays_read_its_lobes_widened_and_its_terms_as_they_are(seen, light, syst
         return np.asarray(widened.combine(of, lit, view))
 
     assert widened.can_widen(whole)
-    plain = prt.radiance(made, light, eye=EYE, materials=blend)
-    np.testing.assert_allclose(read(made, light, 0.0), plain, rtol=1e-4, atol=1e-4)
+    plain = prt.radiance(dynamic_system, light, eye=EYE, materials=blend)
+    np.testing.assert_allclose(read(dynamic_system, light, 0.0), plain, rtol=1e-4, atol=1e-4)
     if name != "with a tensor alone":
         wide = read(whole, sun, 0.3)
         assert off(wide, read(lobes, sun, 0.3)) < 0.1
@@ -150,5 +155,5 @@ def test_a_stopped_precomputation_goes_on(light, tmp_path):
     options = {"size": SIZE, "run": prt.Run(tmp_path / "store")}
     blend = materials(len(mesh.position), 0.5)
     first, again = (dynamic.DynamicSystem(dynamic.precompute(mesh, brdf, **options), brdf) for _ in range(2))
-    color, same = (prt.radiance(made, light, eye=EYE, materials=blend) for made in (first, again))
+    color, same = (prt.radiance(dynamic_system, light, eye=EYE, materials=blend) for dynamic_system in (first, again))
     np.testing.assert_allclose(color, same, rtol=1e-6)
