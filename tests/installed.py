@@ -15,7 +15,7 @@ def main(repository: str) -> None:
     package = pathlib.Path(prt.__file__).resolve()
     if pathlib.Path(repository).resolve() / "jaxprt" in package.parents:
         raise SystemExit(f"the installed package must be used, got {package}")
-    for name in ("py.typed", "view/viewer.js", "view/piece.js"):
+    for name in ("py.typed", "view/browser/viewer.js"):
         if not (package.parent / name).is_file():
             raise SystemExit(f"the wheel must hold jaxprt/{name}")
 

@@ -29,10 +29,9 @@ from jaxprt.sphere import cubemap
 from jaxprt.systems import standard
 from jaxprt.systems.lobe import blurred_light
 from jaxprt.systems.protocol import Exported
-from jaxprt.view import messages, stages
+from jaxprt.view import browser, messages, stages
 from jaxprt.view.messages import Reply
 from jaxprt.view.reduced import PageScene, texels_of, unit_of
-from jaxprt.view.server import MODULE
 from jaxprt.view.session import Session
 from jaxprt.view.stages import counterclockwise
 
@@ -48,8 +47,7 @@ _PAGE = """<!doctype html>
 <body style="margin:0;height:100vh;background:#1a1a1a"><div id="viewer" style="height:100%"></div>
 <script type="text/plain" id="data">{data}</script>
 <script type="module">
-import {{ mount, unpack }} from "{viewer}";
-import {{ answers }} from "{piece}";
+import {{ answers, mount, unpack }} from "{module}";
 const text = document.getElementById("data");
 const packed = Uint8Array.from(atob(text.textContent), (each) => each.charCodeAt(0));
 text.remove();
@@ -500,11 +498,8 @@ def _page(
         *(buffer for sky in skies if sky is not None for buffer in sky.buffers),
     ]
     data = base64.b64encode(zlib.compress(messages.pack(content, buffers), 6)).decode()
-    modules = {
-        name: "data:text/javascript;base64," + base64.b64encode(MODULE.with_name(f"{name}.js").read_bytes()).decode()
-        for name in ("viewer", "piece")
-    }
-    return _PAGE.format(title=html.escape(title), data=data, **modules).encode()
+    module = "data:text/javascript;base64," + base64.b64encode(browser.module().encode()).decode()
+    return _PAGE.format(title=html.escape(title), data=data, module=module).encode()
 
 
 def _skies(session: Session, room: int | float) -> list[Reply | None]:

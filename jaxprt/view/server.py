@@ -3,7 +3,6 @@
 import contextlib
 import http
 import http.server
-import pathlib
 import re
 import secrets
 import socket
@@ -14,11 +13,10 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from jaxprt import require
-from jaxprt.view import messages
+from jaxprt.view import browser, messages
 from jaxprt.view.session import Session
 
 _PORTS = {"http": 80, "https": 443}
-MODULE = pathlib.Path(__file__).with_name("viewer.js")
 _IDLE = 600.0  # seconds that a connection may rest
 _BODY = 30.0  # seconds that a message may take, beside those of its length
 _SLOWEST = 1e5  # bytes a second
@@ -220,7 +218,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._refuse(400, "a request for a page must have no body")
             return
         pages = {"": (_PAGE.encode(), "text/html; charset=utf-8")}
-        pages["viewer.js"] = MODULE.read_bytes(), "text/javascript; charset=utf-8"
+        pages["viewer.js"] = browser.module().encode(), "text/javascript; charset=utf-8"
         page = pages.get(place.split("?")[0])
         if page is None:
             self._refuse(404, "there is no such page")

@@ -13,7 +13,7 @@ import traitlets
 from IPython.display import display
 
 from jaxprt import files
-from jaxprt.view.server import MODULE
+from jaxprt.view import browser
 from jaxprt.view.session import Session
 
 # JupyterLab stacks the outputs of a cell. The static picture disappears when the viewer has received its first answer.
@@ -36,7 +36,7 @@ class Viewer(anywidget.AnyWidget):
         height: Height of the viewer in pixels of the page.
     """
 
-    _esm = MODULE
+    _esm = browser.module()
     height = traitlets.Int(480, min=1).tag(sync=True)
 
     def __init__(self, session: Session, *, height: int = 480):

@@ -1,0 +1,181 @@
+// Draws the sky, the mesh with colors at its vertices, and pictures at rest.
+
+import { clamp } from "./common.js";
+
+const VERTEX = `#version 300 es
+layout(location=0) in vec3 position; layout(location=1) in vec3 color; uniform mat4 matrix; out vec3 c;
+void main(){ c = color; gl_Position = matrix * vec4(position, 1); }`;
+const DISPLAY = `
+uniform float gain; uniform bool encoded; uniform int tone;
+vec3 hable(vec3 x){ return (x * (.15 * x + .05) + .004) / (x * (.15 * x + .5) + .06) - .02 / .3; }
+vec3 aces(vec3 x){ x = x / .6 * mat3(.59719, .35458, .04823, .076, .90834, .01566, .0284, .13383, .83777);
+  x = (x * (x + .0245786) - .000090537) / (x * (.983729 * x + .432951) + .238081);
+  return x * mat3(1.60475, -.53108, -.07367, -.10208, 1.10813, -.00605, -.00327, -.07276, 1.07602); }
+vec3 agx(vec3 x){
+  const mat3 back = mat3(1.6605, -.5876, -.0728, -.1246, 1.1329, -.0083, -.0182, -.1006, 1.1187);
+  x = max(x * inverse(back), 0.) * mat3(.856627153, .0951212405, .0482516061, .137318973, .761241991, .101439036, .111898213, .0767994186, .811302368);
+  x = clamp((log2(max(x, 1e-10)) + 12.47393) / 16.499999, 0., 1.);
+  x = (((((15.5 * x - 40.14) * x + 31.96) * x - 6.868) * x + .4298) * x + .1191) * x - .00232;
+  x = x * inverse(mat3(.899796956, .0871996192, .0130034249, .111420989, .875575586, .0130034249, .111420989, .0871996192, .801379392));
+  return pow(max(x, 1e-6), vec3(2.2)) * back; }
+// The curves of jaxprt/image/tonemap.py. Matrices stand in rows, to the right of vectors.
+vec3 display(vec3 x){ if (encoded) return x; x = clamp(x * gain, 0., 1e6);
+  x = clamp(tone == 1 ? hable(2. * x) / hable(vec3(11.2)) : tone == 2 ? agx(x) : tone == 3 ? aces(x) : x, 0., 1.);
+  return mix(12.92 * x, 1.055 * pow(max(x, vec3(1e-6)), vec3(1. / 2.4)) - .055, step(.0031308, x)); }`;
+const MESH = `#version 300 es
+precision highp float; in vec3 c; out vec4 o; ${DISPLAY}
+void main(){ o = vec4(gl_FrontFacing ? display(c) : vec3(0), 1); } // backs are black, as in pictures`;
+const QUAD = `#version 300 es
+out vec2 at; void main(){ at = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.; gl_Position = vec4(at * 2. - 1., .99999, 1); }`;
+const SKY = `#version 300 es
+precision highp float; in vec2 at; out vec4 o; uniform sampler2D image; uniform mat3 ray; uniform float turn, lod; ${DISPLAY}
+void main(){ vec3 d = normalize(ray * vec3(at * 2. - 1., 1));
+  float lon = atan(d.x, d.z) - turn; vec2 uv = vec2(.5 - lon / 6.283185307, .5 - asin(clamp(d.y, -1., 1.)) / 3.141592654);
+  o = vec4(display(textureLod(image, uv, lod).rgb), 1); }`; // of derivatives there would be a seam
+const STILL = `#version 300 es
+precision highp float; in vec2 at; out vec4 o; uniform sampler2D image; uniform float alpha; ${DISPLAY}
+void main(){ o = vec4(display(textureLod(image, vec2(at.x, 1. - at.y), 0.).rgb), alpha); }`;
+
+export const TONES = ["srgb", "filmic", "agx", "aces"];
+
+const FADE = 200; // milliseconds in which a picture at rest appears
+
+export class Drawing {
+  constructor(canvas) {
+    this.canvas = canvas;
+    const gl = (this.gl = canvas.getContext("webgl2", { alpha: false, antialias: true, preserveDrawingBuffer: true }));
+    if (!gl) throw new Error("this browser has no WebGL2, which the viewer needs");
+    this.build();
+  }
+  build() {
+    const gl = this.gl;
+    const program = (vertex, fragment) => {
+      const made = gl.createProgram();
+      for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+        const shader = gl.createShader(kind);
+        gl.shaderSource(shader, text);
+        gl.compileShader(shader);
+        if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) throw new Error(gl.getShaderInfoLog(shader));
+        gl.attachShader(made, shader);
+      }
+      gl.linkProgram(made);
+      return { made, at: (name) => gl.getUniformLocation(made, name) };
+    };
+    this.mesh = program(VERTEX, MESH);
+    this.sky = program(QUAD, SKY);
+    this.still = program(QUAD, STILL);
+    this.empty = gl.createVertexArray();
+    this.array = gl.createVertexArray();
+    [this.position, this.color, this.index] = [0, 1, 2].map(() => gl.createBuffer());
+    this.skyImage = null;
+    this.stills = []; // pictures at rest: the last one appears over the one before
+  }
+  setMesh(position, face, backs) { // of faces after the first `backs` no backs are seen
+    const gl = this.gl;
+    gl.bindVertexArray(this.array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.position);
+    gl.bufferData(gl.ARRAY_BUFFER, position, gl.STATIC_DRAW);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.index);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, face, gl.STATIC_DRAW);
+    this.count = face.length;
+    this.backs = 3 * (backs ?? face.length / 3);
+    this.colored = false;
+  }
+  setColor(data, encoded, scale) {
+    const gl = this.gl;
+    gl.bindVertexArray(this.array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.color);
+    gl.bufferData(gl.ARRAY_BUFFER, data, gl.STREAM_DRAW);
+    gl.enableVertexAttribArray(1);
+    if (encoded) gl.vertexAttribPointer(1, 3, gl.UNSIGNED_BYTE, true, 3, 0);
+    else gl.vertexAttribPointer(1, 3, gl.HALF_FLOAT, false, 6, 0);
+    this.encoded = encoded;
+    this.scale = scale;
+    this.colored = true;
+  }
+  texture(data, width, height, encoded, repeat) {
+    const gl = this.gl, made = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D, made);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    if (encoded) gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, width, height, 0, gl.RGB, gl.UNSIGNED_BYTE, data);
+    else gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB16F, width, height, 0, gl.RGB, gl.HALF_FLOAT, data);
+    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.LINEAR);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, repeat ? gl.REPEAT : gl.CLAMP_TO_EDGE);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+    return made;
+  }
+  setSky(data, { width, height, scale, levels = 1 }) { // levels: pictures of half the size follow, as mip maps
+    const gl = this.gl;
+    if (this.skyImage) gl.deleteTexture(this.skyImage);
+    this.skyImage = this.texture(data, width, height, false, true);
+    for (let level = 1, first = 3 * width * height; level < levels; level++) {
+      const [w, h] = [width >> level, height >> level];
+      gl.texImage2D(gl.TEXTURE_2D, level, gl.RGB16F, w, h, 0, gl.RGB, gl.HALF_FLOAT, data.subarray(first, first += 3 * w * h));
+    }
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, levels - 1);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+    [this.skyScale, this.skyHeight] = [scale, height];
+  }
+  addStill(data, width, height, encoded, scale) {
+    this.dropStills(1);
+    this.stills.push({ image: this.texture(data, width, height, encoded, false), encoded, scale, since: performance.now() });
+  }
+  dropStills(kept) { while (this.stills.length > kept) this.gl.deleteTexture(this.stills.shift().image); }
+  quad(program, image, gain, encoded, tone) {
+    const gl = this.gl;
+    gl.useProgram(program.made);
+    gl.bindVertexArray(this.empty);
+    gl.bindTexture(gl.TEXTURE_2D, image);
+    gl.uniform1f(program.at("gain"), gain);
+    gl.uniform1i(program.at("encoded"), encoded ? 1 : 0);
+    gl.uniform1i(program.at("tone"), tone);
+  }
+  draw(camera, state, center, now) { // true while a picture at rest appears
+    const gl = this.gl, { width, height } = this.canvas, gain = 2 ** state.stops, tone = TONES.indexOf(state.tone);
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(0.1, 0.1, 0.1, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    gl.disable(gl.DEPTH_TEST);
+    if (state.background && this.skyImage) {
+      this.quad(this.sky, this.skyImage, gain * this.skyScale, false, tone);
+      gl.uniformMatrix3fv(this.sky.at("ray"), false, camera.ray(width / height));
+      gl.uniform1f(this.sky.at("turn"), state.turn);
+      gl.uniform1f(this.sky.at("lod"), Math.log2((2 * Math.tan(camera.angle / 2) * this.skyHeight) / (height * Math.PI)));
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    }
+    if (this.count && this.colored) {
+      gl.enable(gl.DEPTH_TEST);
+      gl.useProgram(this.mesh.made);
+      gl.bindVertexArray(this.array);
+      gl.uniformMatrix4fv(this.mesh.at("matrix"), false, camera.matrix(width / height, center));
+      gl.uniform1f(this.mesh.at("gain"), gain * this.scale);
+      gl.uniform1i(this.mesh.at("encoded"), this.encoded ? 1 : 0);
+      gl.uniform1i(this.mesh.at("tone"), tone);
+      // Backs lie a little deeper: at silhouettes they are as deep as the fronts beside them, and would show as dots.
+      gl.enable(gl.CULL_FACE);
+      gl.enable(gl.POLYGON_OFFSET_FILL);
+      gl.polygonOffset(2, 4);
+      gl.cullFace(gl.FRONT);
+      gl.drawElements(gl.TRIANGLES, this.backs, gl.UNSIGNED_INT, 0);
+      gl.disable(gl.POLYGON_OFFSET_FILL);
+      gl.cullFace(gl.BACK);
+      gl.drawElements(gl.TRIANGLES, this.count, gl.UNSIGNED_INT, 0);
+      gl.disable(gl.CULL_FACE);
+      gl.disable(gl.DEPTH_TEST);
+    }
+    let alpha = 1;
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+    for (const each of this.stills) {
+      alpha = clamp((now - each.since) / FADE, 0, 1);
+      this.quad(this.still, each.image, gain * each.scale, each.encoded, tone);
+      gl.uniform1f(this.still.at("alpha"), alpha);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    }
+    gl.disable(gl.BLEND);
+    return alpha < 1;
+  }
+  close() { this.gl.getExtension("WEBGL_lose_context")?.loseContext(); }
+}

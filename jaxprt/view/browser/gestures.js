@@ -1,0 +1,83 @@
+// What the mouse, fingers and keys do.
+
+import { clamp } from "./common.js";
+
+export const HELP = `drag: orbit · right drag or Ctrl: pan · wheel, pinch: zoom · double-click: look at a point
+Shift-drag: turn the light · drop an HDR or EXR file: another light
+arrows: orbit · Shift-arrows: pan · + -: zoom · [ ]: turn the light · , .: exposure · L: next light · S: next system
+B: bounces · G: background · P: picture at rest · E: exact picture · C: clear the lamps · R: reset · H: this help`;
+
+export function gestures(canvas, frame, on) {
+  const points = new Map();
+  let pinch = null;
+  const spot = (event) => [event.clientX, event.clientY];
+  const middle = () => { const [a, b] = [...points.values()]; return { at: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], apart: Math.hypot(a[0] - b[0], a[1] - b[1]) || 1 }; };
+  const listen = {
+    contextmenu: (event) => event.preventDefault(),
+    pointerdown(event) {
+      if (!on.camera) return;
+      canvas.focus();
+      canvas.setPointerCapture(event.pointerId);
+      points.set(event.pointerId, spot(event));
+      pinch = points.size === 2 ? middle() : null;
+    },
+    pointermove(event) {
+      const from = points.get(event.pointerId);
+      if (!from || !on.camera) return;
+      const to = spot(event), [dx, dy] = [to[0] - from[0], to[1] - from[1]], height = canvas.clientHeight || 1;
+      points.set(event.pointerId, to);
+      if (points.size === 2 && pinch) {
+        const now = middle();
+        on.camera.zoom(pinch.apart / now.apart);
+        on.camera.pan((now.at[0] - pinch.at[0]) / height, (now.at[1] - pinch.at[1]) / height);
+        pinch = now;
+      } else if (event.shiftKey) return on.set({ turn: on.state.turn + 0.01 * dx });
+      else if (event.ctrlKey || event.buttons & 2) on.camera.pan(dx / height, dy / height);
+      else on.camera.orbit(0.01 * dx, 0.01 * dy);
+      on.moved();
+    },
+    pointerup(event) { points.delete(event.pointerId); pinch = null; },
+    pointercancel(event) { points.delete(event.pointerId); pinch = null; },
+    dblclick(event) {
+      if (!on.camera) return;
+      const box = canvas.getBoundingClientRect();
+      on.lookAt((2 * (event.clientX - box.left)) / box.width - 1, 1 - (2 * (event.clientY - box.top)) / box.height);
+    },
+    wheel(event) {
+      if (!on.camera) return;
+      event.preventDefault();
+      on.camera.zoom(Math.exp(0.001 * clamp(event.deltaY, -300, 300)));
+      on.moved();
+    },
+    keydown(event) {
+      if (on.camera && !event.altKey && !event.metaKey && !event.ctrlKey && key(event, on)) event.preventDefault();
+    },
+  };
+  for (const [name, each] of Object.entries(listen)) canvas.addEventListener(name, each, { passive: false });
+  frame.addEventListener("dragover", (event) => event.preventDefault());
+  frame.addEventListener("drop", (event) => { event.preventDefault(); if (on.camera && event.dataTransfer.files[0]) on.drop(event.dataTransfer.files[0]); });
+  return () => { for (const [name, each] of Object.entries(listen)) canvas.removeEventListener(name, each); };
+}
+
+function key(event, on) {
+  const { state } = on, scene = on.scene(), names = Object.keys(scene.systems);
+  const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+  const next = names[(names.indexOf(state.system) + 1) % names.length];
+  if (arrow && event.shiftKey) { on.camera.pan(0.05 * arrow[0], 0.05 * arrow[1]); on.moved(); }
+  else if (arrow) { on.camera.orbit(0.1 * arrow[0], 0.1 * arrow[1]); on.moved(); }
+  else {
+    const act = {
+      "+": () => { on.camera.zoom(0.9); on.moved(); }, "=": () => { on.camera.zoom(0.9); on.moved(); },
+      "-": () => { on.camera.zoom(1 / 0.9); on.moved(); },
+      "[": () => on.set({ turn: state.turn - 0.1 }), "]": () => on.set({ turn: state.turn + 0.1 }),
+      ",": () => on.expose(state.stops - 0.5), ".": () => on.expose(state.stops + 0.5),
+      l: () => on.set({ light: (state.light + 1) % scene.lights.length }), s: () => on.set({ system: next, bounces: state.bounces && scene.systems[next].bounces }),
+      b: () => scene.systems[state.system].bounces && on.set({ bounces: !state.bounces }), g: () => on.set({ background: !state.background }),
+      p: () => on.set({ still: !state.still }), e: () => on.set({ exact: !state.exact }), c: () => on.set({ lamps: [] }), r: () => on.reset(),
+      h: () => { on.help.hidden = !on.help.hidden; },
+    }[event.key.toLowerCase()];
+    if (!act) return false;
+    act();
+  }
+  return true;
+}
