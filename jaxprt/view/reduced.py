@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -19,10 +20,13 @@ from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Part, Scene, TexturedMaterial
 from jaxprt.systems import axes, standard
 from jaxprt.systems.bright_texels import BrightTexels
+from jaxprt.systems.lobe import LobeBrdf
+from jaxprt.systems.lobe.exported import lobe_description, lobe_entries
 from jaxprt.systems.lobe.pyramid import Scales
 from jaxprt.systems.protocol import Blend, Exported, System
 from jaxprt.systems.standard.layered import BASE
 
+_GRAY = 0.5  # albedo that stands for a BRDF without a standard table
 _TEXELS = 64  # number of brightest texels that are summed one by one
 
 
@@ -37,6 +41,8 @@ class PageScene:
         texels: Visibility of single texels for each part, None for parts without; None if a part with lobes or all
             parts lack it, or if the page does not sum single texels.
         level: Finest scale of the visibility of lobes.
+        unshadowed: Edge of the faces of the light, if nothing of the visibility is known and the page shows the scene
+            without shadows; 0 with visibility.
     """
 
     scene: Scene
@@ -44,6 +50,20 @@ class PageScene:
     parts: Sequence[Exported]
     texels: Sequence[Any] | None
     level: int = 0
+    unshadowed: int = 0
+
+    @classmethod
+    def without_visibility(cls, parts: Sequence[Part], shadings: Sequence[Shading], size: int) -> "PageScene":
+        """A scene before rays are traced. Compiles no program.
+
+        Args:
+            parts: The parts of the scene.
+            shadings: Their shading. BRDFs without a standard table become gray diffuse surfaces.
+            size: Edge of the faces of the light.
+        """
+        rows = [_unshadowed(part, shading, size) for part, shading in zip(parts, shadings, strict=True)]
+        parts, shadings, pages = zip(*rows, strict=True)
+        return cls(Scene(list(parts)), shadings, pages, None, unshadowed=size)
 
     @classmethod
     def of(cls, relit: RelitScene) -> "PageScene":
@@ -106,6 +126,8 @@ class PageScene:
     @property
     def texel_edge(self) -> int:
         """Edge of the faces of the light whose brightest texels are summed one by one; 0 if none are."""
+        if self.unshadowed:
+            return self.unshadowed
         return 0 if self.texels is None else next(seen.size for seen in self.texels if seen is not None)
 
     @property
@@ -117,6 +139,66 @@ class PageScene:
     def light_size(self) -> int:
         """Texels along a face's edge of the light that lobes read; 0 without lobes."""
         return max(part.light_size for part in self.parts)
+
+
+class UnshadowedLobes(Exported):
+    """What a page holds of a part before rays are traced: the lobes of its material.
+
+    Attributes:
+        table_lobes: The lobes; None for an ideally diffuse surface.
+        albedo: Color of an ideally diffuse surface.
+        size: Edge of the faces of the light, in texels.
+    """
+
+    table_lobes: LobeBrdf | None
+    albedo: Float[np.ndarray, "3"]
+    size: int = eqx.field(static=True)
+
+    @property
+    def brdf(self) -> LobeBrdf | None:
+        """The table of lobes."""
+        return self.table_lobes
+
+    @property
+    def channels(self) -> int:
+        """Number of channels of the table."""
+        return 1 if self.table_lobes is None else len(self.table_lobes.weight)
+
+    @property
+    def weight(self) -> Float[np.ndarray, "1 3"]:
+        """The color of an ideally diffuse surface."""
+        return self.albedo[None]
+
+    @property
+    def light_size(self) -> int:
+        """Edge of the faces of the light, in texels: all surfaces read the blurred light."""
+        return self.size
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """Numbers by which the page's module reads the table."""
+        return super().description | ({} if self.brdf is None else lobe_description(self.brdf))
+
+    def table(self, what: str) -> Float[np.ndarray, "h q e 4"]:
+        """Entries of the table of lobes."""
+        return super().table(what) if self.brdf is None else lobe_entries(self.brdf)
+
+
+def _unshadowed(part: Part, shading: Shading, size: int) -> tuple[Part, Shading, UnshadowedLobes]:
+    """A part with the material that it has in a page without visibility, its shading, and what the page holds of it."""
+    if shading.layered:
+        part, shading = _bare(part), _base_shading(shading)
+    material = part.material
+    if isinstance(material, TexturedMaterial) and shading.table is None and not shading.matte:
+        part = dataclasses.replace(part, material=dataclasses.replace(material, anisotropy=0.0))
+        shading = channels.of_part(part)
+    none = np.zeros((0, len(part.mesh.position)))
+    table = None if shading.table is None else shading.table.lobes(shading.table.counts[0])
+    gray = np.full(3, _GRAY)
+    albedo = np.broadcast_to(np.asarray(shading.albedo, float), 3) if shading.matte else gray
+    if table is None and not shading.matte:
+        shading = dataclasses.replace(shading, blend=None)
+    return part, shading, UnshadowedLobes(None, none, none, table, albedo, size)
 
 
 def _bare(part: Part) -> Part:

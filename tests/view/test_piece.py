@@ -16,7 +16,7 @@ from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
 from jaxprt.view import messages, stages
-from jaxprt.view.piece import scene_content
+from jaxprt.view.content import scene_content
 from jaxprt.view.reduced import PageScene
 
 pytestmark = pytest.mark.filterwarnings("ignore:the page has the light of environments alone, without bounces")

@@ -75,7 +75,7 @@ class ExportedLobes(Exported):
     @property
     def description(self) -> dict[str, Any]:
         """Numbers by which the page's module reads the table."""
-        return super().description | {"lobes": self.brdf.lobes, "steps": float(self.brdf.weight.shape[-1] - 1)}
+        return super().description | lobe_description(self.brdf)
 
     def table(self, what: str) -> Float[np.ndarray, "h q e 4"]:
         """For each knot and view node: mean, log concentration and weights of each lobe, and albedos.
@@ -84,17 +84,7 @@ class ExportedLobes(Exported):
             ValueError: The table is anisotropic, or too large for a page.
         """
         self.check_table(what)
-        brdf = self.brdf
-        mean, scale, weight, albedo = map(np.asarray, (brdf.mean, brdf.scale, brdf.weight, brdf.diffuse))
-        if not brdf.knot:
-            mean, scale, weight, albedo = mean[:, :, None], scale[:, None], weight[:, :, None], albedo[:, None]
-        lobes, count, nodes = scale.shape
-        result = np.zeros((count, nodes, 2 * lobes + 1, CHANNELS))
-        result[:, :, 0:-1:2, :3] = mean.transpose(2, 3, 1, 0)
-        result[:, :, 0:-1:2, 3] = scale.transpose(1, 2, 0)
-        result[:, :, 1::2, : len(weight)] = weight.transpose(2, 3, 1, 0)
-        result[:, :, -1, : len(albedo)] = albedo.transpose(1, 2, 0)
-        return result
+        return lobe_entries(self.brdf)
 
     def texel_brdf(self, brdf: Callable) -> Callable:
         """The lobes alone."""
@@ -115,3 +105,25 @@ class ExportedLobes(Exported):
         vector = jnp.asarray(self.vector, jnp.result_type(float))
         places = old.position, old.frame, self.light_size
         return self.system.coarse(CoarseTransport(old.pyramid, vector, *places, old.size, spread))
+
+
+def lobe_description(brdf: LobeBrdf) -> dict[str, Any]:
+    """Numbers by which the page's module reads a table of lobes."""
+    return {"lobes": brdf.lobes, "steps": float(brdf.weight.shape[-1] - 1)}
+
+
+def lobe_entries(brdf: LobeBrdf) -> Float[np.ndarray, "h q e 4"]:
+    """A table of lobes for pages: for each knot and view node the mean, log concentration and weights of each lobe.
+
+    The albedos follow the lobes.
+    """
+    mean, scale, weight, albedo = map(np.asarray, (brdf.mean, brdf.scale, brdf.weight, brdf.diffuse))
+    if not brdf.knot:
+        mean, scale, weight, albedo = mean[:, :, None], scale[:, None], weight[:, :, None], albedo[:, None]
+    lobes, count, nodes = scale.shape
+    result = np.zeros((count, nodes, 2 * lobes + 1, CHANNELS))
+    result[:, :, 0:-1:2, :3] = mean.transpose(2, 3, 1, 0)
+    result[:, :, 0:-1:2, 3] = scale.transpose(1, 2, 0)
+    result[:, :, 1::2, : len(weight)] = weight.transpose(2, 3, 1, 0)
+    result[:, :, -1, : len(albedo)] = albedo.transpose(1, 2, 0)
+    return result

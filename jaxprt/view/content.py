@@ -1,0 +1,231 @@
+"""What the browser's GPU needs of a scene and its lights: a description as JSON, and arrays.
+
+Exported pages hold it, and viewers that run Python send it to their page once.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxprt.brdf import GGX, BlinnPhong, CookTorrance
+from jaxprt.brdf.varying import Channels
+from jaxprt.relit.channels import Shading
+from jaxprt.scene import Environment, Part, TexturedMaterial, material_table
+from jaxprt.scene.material import Texture
+from jaxprt.sphere import cubemap
+from jaxprt.systems import standard
+from jaxprt.systems.lobe import blurred_light
+from jaxprt.systems.protocol import Exported
+from jaxprt.view.reduced import PageScene, texels_of, unit_of
+
+NO_SCALES = {"edges": [1], "spreads": [1.0], "starts": [0]}  # for scenes without glossy parts
+_STARTS = ("first", "weightStart", "pyramidStart", "visibleStart", "arrivedStart", "bitStart")
+# Terms by which the page's module represents `ShininessFamily` and `SlopeFamily`.
+_TERMS = {standard.BLINN_PHONG: [3, 4], standard.COOK_TORRANCE: [3, 5, 6]}
+_LIGHT = 32  # most texels along the edge of the faces of the light that lobes read without visibility
+_SKY = 64  # most texels along the edge of a light's faces
+
+
+def page_content(page: PageScene, lights: Sequence[Environment]) -> tuple[dict[str, Any], list[bytes]]:
+    """JSON description and arrays of a scene and its lights, without positions and faces.
+
+    `Piece` in the page's module defines the order of the arrays: those of `scene_content`, borders of cubemaps, and
+    texels of the lights.
+    """
+    content, arrays = scene_content(page)
+    mips, size = mip_edges(lights[0].radiance.shape[-2]), page.light_size
+    blurring = blur_parameters(size) if size else NO_SCALES
+    rims = sorted({mips[0], *blurring["edges"]}, reverse=True)
+    content |= {"light": blurring, "mips": mips, "rims": rims, "lights": len(lights), "glossy": bool(size)}
+    arrays += [cubemap.border_index(size=edge).astype("<u4").tobytes() for edge in rims]
+    return content, arrays + [light_texels(light, mips[0]) for light in lights]
+
+
+def unshadowed_content(
+    parts: Sequence[Part], shadings: Sequence[Shading], lights: Sequence[Environment]
+) -> tuple[dict[str, Any], list[bytes]]:
+    """`page_content` of a scene of which no visibility is known: the page shows it without shadows.
+
+    Args:
+        parts: The parts of the scene.
+        shadings: Their shading, from `jaxprt.relit.build.shaded`. BRDFs without a standard table are shown as gray
+            diffuse surfaces, and layers are left out.
+        lights: The lights.
+    """
+    page = PageScene.without_visibility(parts, shadings, min(_LIGHT, lights[0].radiance.shape[-2]))
+    return page_content(page, lights)
+
+
+def scene_content(page: PageScene) -> tuple[dict[str, Any], list[bytes]]:
+    """JSON description and arrays of all parts. `Piece` in the page's module defines their order."""
+    bits = page.bits or [np.zeros((0, 0), np.uint8)] * len(page.parts)
+    unit, visible_unit = unit_of([held.vector for held in page.parts]), unit_of([held.visible for held in page.parts])
+    terms = max(-(-len(unit) // 4) * 4, 4)
+    place: dict[str, int] = dict.fromkeys(_STARTS, 0)
+    tables, normals = _Tables(), _normals(page)
+    parts, stride = [], 0
+    arrays: list[list[np.ndarray]] = [[] for _ in range(6)]
+    rows = zip(page.scene.parts, page.shading, page.parts, bits, normals, strict=True)
+    for part, shading, held, bit, direction in rows:
+        start, table = tables.add(f"part {part.name!r}", held)
+        weight, seen, described = _weights(shading, held), held.means, _material_json(part.material, shading)
+        count = held.vector.shape[1]
+        about = held.description | {"family": _family(shading), "texels": bool(bit.size) or bool(page.unshadowed)}
+        about |= {"name": part.name, "count": count, "channels": weight.shape[1] - 1}
+        about |= {"nodes": table.shape[1], "entries": table.shape[2], "terms": -(-len(held.vector) // 4) * 4}
+        about |= {"weightStep": 0 if described else weight.shape[1], **(described or {})}
+        parts.append(about | place | {"tableStart": start})
+        weight = weight[:1] if described else weight
+        stride = max(stride, seen.shape[1])
+        vector = _bytes(held.vector, unit, terms)
+        visible = _bytes(held.visible, visible_unit, 4 * about["words"])
+        normal = np.round(32767 * np.asarray(direction))
+        kinds = "<i2", "i1", "u1", "<f4", "i1", "u1"
+        for column, array, kind in zip(arrays, (normal, vector, seen, weight, visible, bit), kinds, strict=True):
+            column.append(array.astype(kind).reshape(-1))
+        pairs = count * -(-(about["bands"] ** 2) // 2)
+        sizes = count, weight.size // 4, seen.size, visible.size // 4, pairs, bit.size
+        place = {name: start + size for (name, start), size in zip(place.items(), sizes, strict=True)}
+    content = {"parts": parts, "terms": terms, "vectorUnit": unit.tolist(), "stride": stride, **_scales(page)}
+    content |= {"visibleUnit": visible_unit.tolist(), "arrived": place["arrivedStart"]}
+    edge = page.texel_edge
+    content |= {"texelEdge": edge, "texels": texels_of(edge) if edge else 0, "visibility": not page.unshadowed}
+    joined = [np.concatenate(column) for column in arrays]
+    joined.insert(3, tables.joined())
+    joined[2] = np.append(joined[2], np.zeros(4 - len(joined[2]) % 4, np.uint8))  # whole words
+    return content, [array.tobytes() for array in joined]
+
+
+def _normals(page: PageScene) -> list[Float[np.ndarray, "v 3"]]:
+    """Normals at the vertices of each part, with those of normal maps."""
+    tilted = material_table.of_parts(page.scene.parts).at_vertices().normal
+    if tilted is None:
+        return [np.asarray(shading.mesh.normal) for shading in page.shading]
+    counts = [len(shading.mesh.normal) for shading in page.shading]
+    return np.split(np.asarray(tilted), np.cumsum(counts)[:-1])
+
+
+class _Tables:
+    """The tables of a page. Parts with one BRDF share one table."""
+
+    def __init__(self):
+        """Starts without tables."""
+        self._made: dict[Any, tuple[int, Float[np.ndarray, "h q e 4"]]] = {}
+        self._end = 0
+
+    def add(self, what: str, held: Exported) -> tuple[int, Float[np.ndarray, "h q e 4"]]:
+        """The table of a part, which messages call `what`, and where its texels start among those of all tables."""
+        leaves, kind = jax.tree.flatten(held.brdf)
+        key = kind, *((np.shape(leaf), np.asarray(leaf).tobytes()) for leaf in leaves)
+        if key not in self._made:
+            table = held.table(what)
+            self._made[key] = self._end, table
+            self._end += table.size // 4
+        return self._made[key]
+
+    def joined(self) -> Float[np.ndarray, " n"]:
+        """The texels of all tables."""
+        return np.concatenate([table.astype("<f4").reshape(-1) for _, table in self._made.values()])
+
+
+def _bytes(value: Float[np.ndarray, "k v"], unit: Float[np.ndarray, " m"], length: int) -> Float[np.ndarray, "v l"]:
+    """Values quantized to integer multiples of the units, in rows of a given length."""
+    padded = np.zeros((value.shape[1], length))
+    padded[:, : len(value)] = np.round(value / unit[: len(value), None]).T
+    return padded
+
+
+def _scales(page: PageScene) -> dict[str, Any]:
+    """The scales of visibility that the page keeps."""
+    scale, level = page.scales, page.level
+    if scale is None:
+        return NO_SCALES
+    starts = scale.start[level:] - scale.start[level]
+    return {"edges": scale.edge[level:].tolist(), "spreads": scale.spread[level:].tolist(), "starts": starts.tolist()}
+
+
+def mip_edges(size: int) -> list[int]:
+    """Sizes of the cubemaps in the mip chain that the page computes from a light."""
+    while size > _SKY and size % 2 == 0:
+        size //= 2
+    result = [size]
+    while result[-1] % 2 == 0 and result[-1] > 4:
+        result.append(result[-1] // 2)
+    return result
+
+
+def blur_parameters(size: int) -> dict[str, Any]:
+    """Parameters for blurring the light to all lobe widths, as `jaxprt.systems.lobe.blurred_light.prefilter` does."""
+    scale = blurred_light.scales(size)
+    pairs = zip(scale.edge.tolist(), scale.spread.tolist(), strict=True)
+    source, variances, concentration = zip(*(blurred_light.blur(*pair, size=size) for pair in pairs), strict=True)
+    return {
+        "edges": scale.edge.tolist(),
+        "spreads": scale.spread.tolist(),
+        "starts": scale.start.tolist(),
+        "total": scale.total,
+        "sources": source,
+        "concentrations": concentration,
+        "reaches": [min(np.pi, blurred_light.REACH * np.sqrt(variance)) for variance in variances],
+    }
+
+
+def _family(shading: Shading) -> dict[str, list]:
+    """Numbers of the BRDF terms of a part's channels in the page's module, and their factors; empty if unknown."""
+    if shading.blend is None or shading.scale is None:
+        return {"terms": [], "scale": []}
+    terms = list(shading.term) if shading.table is None else _TERMS.get(shading.table, list(shading.term))
+    return {"terms": terms, "scale": np.asarray(shading.scale, float).tolist()}
+
+
+def _weights(shading: Shading, held: Exported) -> Float[np.ndarray, "v k 4"]:
+    """Channel weights at each vertex, followed by its emission. The first row also holds the logarithm of roughness."""
+    count = len(shading.mesh.position)
+    weight = held.weight if shading.blend is None else np.asarray(shading.blend.weight)
+    weight = np.broadcast_to(weight, (count, *weight.shape[-2:]))
+    result = np.zeros((count, weight.shape[1] + 1, 4))
+    result[:, :-1, :3] = weight
+    if shading.blend is not None and shading.blend.parameter:
+        result[:, 0, 3] = np.asarray(shading.blend.parameter[0])
+    elif isinstance(shading.brdf, Channels):  # isotropic GGX with a constant roughness
+        result[:, 0, 3] = np.log(
+            next(float(model.roughness[0]) for model in shading.brdf.model if isinstance(model, GGX))
+        )
+    if shading.emitted is not None:
+        result[:, -1, :3] = np.asarray(shading.emitted)
+    return result
+
+
+def _colors(material: Any, *names: str) -> dict[str, list[float]]:
+    """Parameters of a material in three colors."""
+    return {name: np.broadcast_to(np.asarray(getattr(material, name), float), 3).tolist() for name in names}
+
+
+def _material_json(material: Any, shading: Shading) -> dict[str, Any] | None:
+    """Parameters of a material that is the same at all vertices; None for other materials."""
+    if isinstance(material, BlinnPhong) and shading.table == standard.BLINN_PHONG:
+        return {"material": _colors(material, "diffuse", "specular") | {"exponent": float(material.exponent)}}
+    if isinstance(material, CookTorrance) and shading.table == standard.COOK_TORRANCE:
+        return {"material": _colors(material, "diffuse", "specular", "f0") | {"slope": float(material.roughness)}}
+    if not isinstance(material, TexturedMaterial) or shading.scale is None:
+        return None
+    if any(isinstance(leaf, Texture) for leaf in jax.tree.leaves(material, is_leaf=lambda x: isinstance(x, Texture))):
+        return None
+    names = ("base_color", "metallic", "specular", "specular_color", "ior", "roughness")
+    values = {name: np.asarray(getattr(material, name), float).tolist() for name in names}
+    return {"material": values}
+
+
+def light_texels(light: Environment, size: int) -> bytes:
+    """The texels of a light for the page, at lower resolution."""
+    radiance = np.asarray(light.radiance, np.float64)
+    fold = radiance.shape[-2] // size
+    if fold > 1:
+        area = np.asarray(cubemap.solid_angle(size=radiance.shape[-2]), np.float64)[..., None]
+        shape = 6, size, fold, size, fold, -1
+        radiance, whole = (values.reshape(shape).sum((2, 4)) for values in (radiance * area, area))
+        radiance = radiance / whole
+    return np.broadcast_to(radiance, (*radiance.shape[:-1], 3)).astype("<f4").tobytes()
