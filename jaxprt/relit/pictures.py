@@ -82,10 +82,12 @@ class PictureView(eqx.Module):
     lamp_rays: bool = eqx.field(static=True, default=False)
 
     @promoted
-    def picture(self, environment: Environment, *, between: Between = None) -> Float[Array, "h w c"]:
+    def picture(
+        self, environment: Environment, *, background: bool = True, between: Between = None
+    ) -> Float[Array, "h w c"]:
         """Renders the picture under an environment, in linear radiance.
 
-        `between` is a function that is called between steps of the work, as in `RelitScene.picture`.
+        `background` and `between` are those of `RelitScene.picture`.
 
         Raises:
             TypeError: `environment` is not an `Environment`.
@@ -107,10 +109,13 @@ class PictureView(eqx.Module):
             color = _color(self, row, arriving, light, lamps, added, recompute=recompute)
             rows.append((row.index, finished(color, between)))
             colors = max(colors, color.shape[-1])
-        picture = canvas.sky(environment, self.camera, self.ray, self.pixels.background, colors=colors)
+        if background:
+            picture = canvas.sky(environment, self.camera, self.ray, self.pixels.background, colors=colors)
+        else:
+            picture = jnp.zeros((*self.ray.shape[:2], colors), environment.radiance.dtype)
         for index, color in rows:
             picture = canvas.draw(picture, self.pixels, index, color)
-        return picture if self.fold == 1 else _folded(picture, fold=self.fold)
+        return folded(picture, fold=self.fold)
 
 
 def _traced_light(picture: PictureView, environment: Environment) -> TracedLight | None:
@@ -229,10 +234,7 @@ def make(
     """
     if not isinstance(shadow, Environment) and shadow not in ("rays", "vertices"):
         raise ValueError(f'shadows must be "rays", "vertices" or an Environment, got {require.shown(shadow)}')
-    if type(samples) is not int or samples not in SAMPLES:
-        raise ValueError(f"samples must be 1, 4 or 16, got {samples!r}")
-    samples, fold = SAMPLES[samples]
-    camera = dataclasses.replace(camera, width=fold * camera.width, height=fold * camera.height)
+    samples, camera, fold = drawn(camera, samples)
     with compile_time(stage.mesh, camera, stage.bend) if stage.sharp_groups else contextlib.nullcontext():
         pixels, rows = _placed(stage, camera, samples, between)
     rays = isinstance(shadow, Environment) or shadow == "rays"
@@ -264,6 +266,18 @@ def make(
     return PictureView(stage, arriving, camera, pixels, ray, tuple(complete), reflected, fold, way, keep, shares, rays)
 
 
+def drawn(camera: Camera, samples: int) -> tuple[int, Camera, int]:
+    """Samples of each drawn pixel, the camera of drawn pixels, and the edge of a pixel in them.
+
+    Raises:
+        ValueError: `samples` is not 1, 4 or 16.
+    """
+    if type(samples) is not int or samples not in SAMPLES:
+        raise ValueError(f"samples must be 1, 4 or 16, got {samples!r}")
+    count, fold = SAMPLES[samples]
+    return count, dataclasses.replace(camera, width=fold * camera.width, height=fold * camera.height), fold
+
+
 def _seen(
     stage: Stage,
     surface: Surface,
@@ -280,9 +294,13 @@ def _seen(
     return view(sampled(surface, 1), on_group, look, eye, **options)
 
 
+def folded(picture: Float[Array, "h w c"], *, fold: int) -> Float[Array, "_ _ c"]:
+    """The picture with squares of `fold` x `fold` pixels averaged to one."""
+    return picture if fold == 1 else _folded(picture, fold=fold)
+
+
 @partial(jit, static_argnames="fold")
 def _folded(picture: Float[Array, "h w c"], *, fold: int) -> Float[Array, "_ _ c"]:
-    """The picture with squares of `fold` x `fold` pixels averaged to one."""
     height, width, colors = picture.shape
     return jnp.mean(picture.reshape(height // fold, fold, width // fold, fold, colors), (1, 3))
 

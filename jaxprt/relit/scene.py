@@ -443,6 +443,7 @@ class RelitScene(System):
         materials: Mapping[str, Any] | None = None,
         samples: int = 4,
         shadows: str = "rays",
+        background: bool = True,
         between: Between = None,
     ) -> Float[Array, "h w c"]:
         """Renders the scene under an environment, in linear radiance.
@@ -458,6 +459,7 @@ class RelitScene(System):
             shadows: "rays" traces shadows of the brightest texels from the points of the picture, so that they are
                 sharp on any mesh. "vertices" interpolates visibility between vertices, which is always done where JAX
                 traces the light or the camera. Rays are constants of derivatives.
+            background: False leaves out the environment where it is seen. Colors are then premultiplied by `coverage`.
             between: Function that is called after each stage and after each block of 8,192 points. If it raises an
                 exception, rendering stops. Not inside `jax.jit`.
 
@@ -472,7 +474,7 @@ class RelitScene(System):
         if not isinstance(shadows, str):
             raise TypeError(f'shadows must be "rays" or "vertices", got {require.shown(shadows)}')
         view = self._picture_view(camera, materials, samples=samples, keep=False, shadow=shadows, between=between)
-        return view.picture(environment, between=between)
+        return view.picture(environment, background=background, between=between)
 
     @promoted
     def picture_view(
@@ -505,7 +507,7 @@ class RelitScene(System):
 
         Args:
             camera: The camera; `self.camera` if None.
-            samples: Samples of each pixel, 4 or 1.
+            samples: Samples of each pixel: 1, 4 or 16, as in `picture`.
 
         Raises:
             TypeError: `camera` is not a `Camera`.
@@ -513,11 +515,13 @@ class RelitScene(System):
         """
         camera = self.camera if camera is None else camera
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
+        samples, camera, fold = pictures.drawn(camera, samples)
         backs = sides.hidden_backs(self.scene)
         hidden = groups.faces_of(self.mesh, np.repeat(backs, self.place.counts)) if backs.any() else None
         occluder = None if self.mesh.opacity is None else caster(self.mesh).occluder
         options = {"samples": samples, "hidden": hidden, "occluder": occluder}
-        return pixels.coverage(self.drawn, camera.local(self.mesh.origin), **options)
+        cover = pixels.coverage(self.drawn, camera.local(self.mesh.origin), **options)
+        return pictures.folded(cover[..., None], fold=fold)[..., 0]
 
     @promoted
     def exposure(self, picture: Float[Array, "h w c"], camera: Camera | None = None) -> Float[Array, ""]:
