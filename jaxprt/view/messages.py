@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxprt import require
@@ -68,7 +69,14 @@ class Look(NamedTuple):
 
 
 # Material parameters that can change: their number of values and largest value.
-MATERIAL = {"roughness": (1, 1.0), "exponent": (1, 1e6), "f0": (1, 1.0), "diffuse": (3, 1.0), "specular": (3, 1.0)}
+MATERIAL = {
+    "roughness": (1, 1.0),
+    "exponent": (1, 1e6),
+    "metallic": (1, 1.0),
+    "f0": (1, 1.0),
+    "diffuse": (3, 1.0),
+    "specular": (3, 1.0),
+}
 
 
 def look(message: Mapping[str, Any], *, systems: Sequence[str], lights: int) -> Look:
@@ -235,12 +243,16 @@ def encode(color: ArrayLike, *, stops: float | None, tone: str = "srgb") -> tupl
     if stops is None:
         scale = max(1.0, float(np.max(np.abs(value), initial=0.0)) / _LARGEST_HALF)
         return np.clip(value / np.float32(scale), -_LARGEST_HALF, _LARGEST_HALF).astype("<f2").tobytes(), scale
-    exposed = apply_curve(value * np.float32(2.0**stops), tone, np)
-    display = np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * exposed ** (1 / 2.4) - 0.055)
-    level = np.round(255 * display).astype(np.uint8)
+    level = np.round(255 * displayed(value, stops=stops, tone=tone)).astype(np.uint8)
     # Differences between successive entries of a channel compress better, because neighbors are similar.
     flat = np.moveaxis(level.reshape(-1, level.shape[-1]), -1, 0)
     return zlib.compress(np.diff(flat, axis=1, prepend=np.uint8(0)).tobytes(), 1), 1.0
+
+
+def displayed(color: ArrayLike, *, stops: float, tone: str) -> Float[np.ndarray, "..."]:
+    """Linear colors as `jaxprt.image.display` shows them, without a compiled program for each size."""
+    exposed = apply_curve(np.asarray(color, np.float32) * np.float32(2.0**stops), tone, np)
+    return np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * exposed ** (1 / 2.4) - 0.055)
 
 
 def _items(message: Mapping[str, Any], name: str) -> Sequence[Any]:

@@ -35,7 +35,9 @@ _FIRST = 2  # finest scale of visibility that is stored as bytes
 _SMOOTHEST = 0.25  # least roughness that users of a page can choose: smoother materials vary over a bright texel
 _VIEWS = 4  # views from which the error is measured
 _PAGE = """<!doctype html>
-<html lang="en"><meta charset="utf-8"><title>{title}</title><link rel="icon" href="data:,">
+<html lang="en"><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title><link rel="icon" href="data:,">
 <body style="margin:0;height:100vh;background:#1a1a1a"><div id="viewer" style="height:100%"></div>
 <script type="text/plain" id="data">{data}</script>
 <script type="module">

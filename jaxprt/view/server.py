@@ -22,7 +22,9 @@ _BODY = 30.0  # seconds that a message may take, beside those of its length
 _SLOWEST = 1e5  # bytes a second
 _LINGER = 5.0  # most seconds in which bytes that were refused are still received
 _PAGE = """<!doctype html>
-<html lang="en"><meta charset="utf-8"><title>jaxprt</title><link rel="icon" href="data:,">
+<html lang="en"><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>jaxprt</title><link rel="icon" href="data:,">
 <body style="margin:0;height:100vh;background:#1a1a1a"><div id="viewer" style="height:100%"></div>
 <script type="module">
 import { mount, unpack } from "./viewer.js";

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxprt import require
+from jaxprt import files, require
 from jaxprt.image import display, render, sky
 from jaxprt.image.pixels import seen_from_front
 from jaxprt.image.tonemap import TONES
@@ -32,6 +32,9 @@ _LARGEST = 2048.0  # most pixels along an edge of a picture
 _PICTURE = 480, 360  # columns and rows of the picture that a saved notebook keeps
 _PIXELS = 400  # pixels of a picture at which the exact sum is compared
 _COARSE = {"still": 2, "exact": 4}  # downscaling factor of coarse pictures
+_LARGEST_FILE = 8192.0  # most pixels along an edge of a picture that is saved
+_MOST_PIXELS = 1 << 24  # of a picture that is saved
+_FINE_PIXELS = 1 << 22  # up to which such a picture has 16 samples a pixel in place of 4
 _SKY_ROWS = 2048.0  # most rows of the picture of a light
 _VIEWERS = 64  # most viewers whose newest look is remembered
 
@@ -97,6 +100,7 @@ class Session:
             "look": self._look,
             "still": self._still,
             "exact": self._exact,
+            "picture": self._picture,
             "sky": self._sky,
             "drop": self._drop,
         }
@@ -138,7 +142,7 @@ class Session:
         scene = self.stages.scene
         mesh, low, high = scene.mesh, *bounds(scene.mesh)
         parts = [
-            {"name": part.name, "free": stages.freedom(shading, part.material)}
+            {"name": part.name, "vertices": len(part.mesh.position), "free": stages.freedom(shading, part.material)}
             for part, shading in zip(scene.scene.parts, scene.shading, strict=True)
         ]
         camera = scene.camera
@@ -147,7 +151,7 @@ class Session:
             "parts": parts,
             "lights": self.stages.name,
             "systems": {name: {"bounces": system.bounces is not None} for name, system in self.stages.systems.items()},
-            "rests": ["still", "exact"],
+            "rests": ["still", "exact", "picture"],
             "vertices": len(mesh.position),
             "triangles": len(mesh.face),
             "center": ((low + high) / 2).tolist(),
@@ -226,6 +230,26 @@ class Session:
         data, scale = messages.encode(truth.color[0], stops=_stops(message), tone=_tone(message))
         size = {"width": truth.camera.width, "height": truth.camera.height}
         return Reply({"kind": "still", "seq": seq, "scale": scale, "exact": True, **told, **size}, [data])
+
+    def _picture(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+        """A PNG file of a picture of any size. Newer looks do not abandon it."""
+        look, _ = self._parse(message)
+        width, height = (int(messages.number(message, key, 1.0, _LARGEST_FILE)) for key in ("width", "height"))
+        if width * height > _MOST_PIXELS:
+            raise ValueError(f"a picture must have at most {_MOST_PIXELS} pixels, got {width} x {height}")
+        options = {"samples": 16 if width * height <= _FINE_PIXELS else 4, "between": self._until_ended}
+        clear = messages.truth(message, "transparent")
+        picture = (self.stages.cutout if clear else self.stages.picture)(look, width, height, **options)
+        exposure = {"stops": _stops(message) or 0.0, "tone": _tone(message)}
+        shown = [messages.displayed(picture[..., :3], **exposure), picture[..., 3:]]
+        with tempfile.TemporaryDirectory() as folder:
+            path = pathlib.Path(folder) / "picture.png"
+            files.write_png(path, np.concatenate(shown, -1))
+            return Reply({"kind": "picture", "width": width, "height": height}, [path.read_bytes()])
+
+    def _until_ended(self) -> None:
+        if self._ended:
+            raise _LateError
 
     def _sky(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         """Pictures of a light before rotation, each of half as many rows as the one before."""

@@ -154,6 +154,17 @@ class Stages:
         color = self.system(look).picture(*arguments, materials=self.materials(look), **options)
         return np.broadcast_to(np.asarray(color), (height, width, 3))
 
+    def cutout(
+        self, look: Look, width: int, height: int, *, samples: int = 4, between: Between = None
+    ) -> Float[np.ndarray, "h w 4"]:
+        """The picture without the environment behind it: linear colors, not premultiplied, and alpha."""
+        system, eye = self.system(look), camera(look, width, height)
+        options = {"samples": samples, "background": False, "between": between}
+        color = np.asarray(system.picture(self.environment(look), eye, materials=self.materials(look), **options))
+        alpha = np.asarray(system.coverage(eye, samples=samples))[..., None]
+        straight = np.divide(color, alpha, out=np.zeros(color.shape, np.float32), where=alpha > 0)
+        return np.concatenate([np.broadcast_to(straight, (height, width, 3)), alpha], -1)
+
     def direct_picture(self, look: Look, width: int, height: int, *, between: Between) -> Float[np.ndarray, "h w 3"]:
         """The picture under direct light of the environment only."""
         arguments = self.environment(look), camera(look, width, height)
@@ -242,15 +253,17 @@ def freedom(shading: Shading, material: Any) -> dict[str, Any] | None:
         return free
     low, high = roughness_range(shading)
     tint = np.asarray(material.specular_color)
+    if material.metallic_texture is None:
+        free["metallic"] = float(material.metallic)
     if high > low and material.roughness_texture is None:
         free |= {"roughness": float(material.roughness), "roughness_range": [low, high]}
-    if float(material.metallic) < 1:
+    if "metallic" in free or float(material.metallic) < 1:
         free |= {"f0": min(float(tint.max()) * _f0(material), 1.0), "specular": (tint / max(tint.max(), 1e-6)).tolist()}
     return free
 
 
 def change_material(material: Any, name: str, values: Mapping[str, Any]) -> Changeable:
-    """The material with other values of roughness, reflectance and colors.
+    """The material with other values of roughness, metallicity, reflectance and colors.
 
     Raises:
         ValueError: The material is a BRDF, which cannot change.
@@ -269,9 +282,7 @@ def change_material(material: Any, name: str, values: Mapping[str, Any]) -> Chan
         return dataclasses.replace(material, **new)
     if not isinstance(material, TexturedMaterial):
         raise ValueError(f"the material of part {name!r} is a BRDF, which cannot change in the viewer")
-    new: dict[str, Any] = {}
-    if "roughness" in values:
-        new["roughness"] = values["roughness"]
+    new: dict[str, Any] = {key: values[key] for key in ("roughness", "metallic") if key in values}
     if "diffuse" in values:
         new["base_color"] = jnp.asarray(values["diffuse"])
     if "f0" in values or "specular" in values:

@@ -73,7 +73,7 @@ class Viewer(anywidget.AnyWidget):
 
     def _heard(self, widget: Any, message: Any, buffers: Sequence[Any]) -> None:
         if isinstance(message, dict) and isinstance(message.get("content"), dict):
-            threads = self._rests if message["content"].get("kind") in ("still", "exact") else self._looks
+            threads = self._rests if message["content"].get("kind") in ("still", "exact", "picture") else self._looks
             threads.submit(self._answer, message, [bytes(buffer) for buffer in buffers])
 
     def _answer(self, message: dict[str, Any], buffers: list[bytes]) -> None:

@@ -71,7 +71,7 @@ def off(found, true):
     return np.linalg.norm(found - true) / np.linalg.norm(true)
 
 
-MATERIALS = {"roughness": 0.7, "f0": 0.2, "specular": [1.0, 0.5, 0.2], "diffuse": [0.1, 0.4, 0.3]}
+MATERIALS = {"roughness": 0.7, "metallic": 0.3, "f0": 0.2, "specular": [1.0, 0.5, 0.2], "diffuse": [0.1, 0.4, 0.3]}
 LAMPS = [{"direction": [0.2, 1.0, 0.5], "angle": 0.4, "radiance": [5.0, 4.0, 3.0]}]
 
 

@@ -1,6 +1,7 @@
 """Answers of a session: colors and pictures of the state that is asked for, and words where it is wrong."""
 
 import dataclasses
+import io
 import json
 import tempfile
 import threading
@@ -10,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
 import jaxprt as prt
 from jaxprt import files, image, require
@@ -60,7 +62,9 @@ def test_a_scene_is_told_with_what_can_change(session, systems):
     ball, ground = reply.content["parts"]
     assert ball["free"]["roughness_range"] == [0, 1]
     assert ball["free"]["f0"] == pytest.approx(0.04)
+    assert ball["free"]["metallic"] == 0
     assert set(ground["free"]) == {"diffuse"}
+    assert [part["vertices"] for part in (ball, ground)] == [len(part.mesh.position) for part in scene.scene.parts]
     assert reply.content["systems"] == {"lobes": {"bounces": True}, "harmonics": {"bounces": False}}
 
 
@@ -78,16 +82,41 @@ def test_a_look_is_the_radiance_of_its_state(session, systems, lights, look, sys
 def test_materials_of_a_look_are_those_of_the_scene_with_them(session, systems, lights, look):
     scene = systems["lobes"]
     old = scene.scene["ball"].material
-    look["materials"] = {"ball": {"roughness": 0.7, "f0": 0.5, "diffuse": [0.1, 0.2, 0.3], "specular": [1, 0.5, 0.2]}}
+    change = {"roughness": 0.7, "metallic": 0.3, "f0": 0.5, "diffuse": [0.1, 0.2, 0.3], "specular": [1, 0.5, 0.2]}
+    look["materials"] = {"ball": change}
     new = dataclasses.replace(
         old,
         roughness=0.7,
+        metallic=0.3,
         base_color=jnp.array([0.1, 0.2, 0.3]),
         specular_color=jnp.array([1, 0.5, 0.2]) * 0.5 / 0.04,
     )
     near(
         halves(session.answer(look)), scene.without_bounces().radiance(lights["lamp"], eye=EYE, materials={"ball": new})
     )
+
+
+def test_a_saved_picture_is_that_of_the_scene_and_its_alpha_is_what_surfaces_cover(session, systems, lights, look):
+    asked = look | {"kind": "picture", "width": 24, "height": 16, "stops": -1.0, "tone": "filmic", "turn": 0.7}
+    scene = systems["lobes"].without_bounces()
+    camera = Camera(look["eye"], look["target"], [0.0, 1.0, 0.0], look["field_of_view"], 24, 16)
+    light = rotate(lights["lamp"], turned(0.7))
+
+    def saved(transparent):
+        reply = session.answer(asked | {"transparent": transparent})
+        assert reply.content == {"kind": "picture", "width": 24, "height": 16}
+        return np.asarray(Image.open(io.BytesIO(reply.buffers[0]))) / 255
+
+    picture = scene.picture(light, camera, samples=16)
+    np.testing.assert_allclose(saved(False), image.display(picture, tone="filmic", stops=-1.0), atol=0.6 / 255)
+    clear, cover = saved(True), np.asarray(scene.coverage(camera, samples=16))
+    np.testing.assert_allclose(clear[..., 3], cover, atol=0.6 / 255)
+    assert {0.0, 1.0} < set(cover.ravel().tolist())  # and some between them
+    alone = scene.picture(light, camera, samples=16, background=False)
+    straight = np.asarray(alone)[cover > 0] / cover[cover > 0, None]
+    shown = image.display(jnp.asarray(straight), tone="filmic", stops=-1.0)
+    np.testing.assert_allclose(clear[cover > 0, :3], shown, atol=0.6 / 255)
+    np.testing.assert_array_equal(clear[cover == 0], 0)
 
 
 def test_a_light_that_turns_leaves_the_view_alone(session, look, monkeypatch):
@@ -313,11 +342,20 @@ WRONG = {
     "target": ({"target": [2.0, 1.5, 4.0]}, "eye and target must be different points"),
     "angle": ({"field_of_view": 4}, "field_of_view must be from 0.001 to"),
     "size": ({"kind": "still", "width": 0, "height": 4}, "width must be from 1 to 2048, got 0"),
+    "picture": ({"kind": "picture", "width": 4, "height": 9000}, "height must be from 1 to 8192, got 9000"),
+    "pixels": (
+        {"kind": "picture", "width": 8000, "height": 4000},
+        "must have at most 16777216 pixels, got 8000 x 4000",
+    ),
+    "clear": (
+        {"kind": "picture", "width": 4, "height": 4, "transparent": 1},
+        "transparent must be true or false, got 1",
+    ),
     "part": ({"materials": {"cat": {"f0": 0.1}}}, "materials must be for the parts ball, ground, got one for 'cat'"),
     "range": ({"materials": {"ball": {"f0": 2}}}, "f0 must be from 0 to 1, got 2"),
     "name": (
         {"materials": {"ball": {"fur": 1}}},
-        "must be a dictionary with keys among roughness, exponent, f0, diffuse, specular",
+        "must be a dictionary with keys among roughness, exponent, metallic, f0, diffuse, specular",
     ),
     "rough": ({"materials": {"ball": {"roughness": 1.1}}}, "roughness must be from 0 to 1, got 1.1"),
     "gloss": ({"materials": {"ground": {"f0": 0.1, "specular": [1, 1, 1]}}}, None),

@@ -6,7 +6,20 @@ import re
 
 _FOLDER = pathlib.Path(__file__).parent
 # Each file imports from files before it.
-_FILES = ("common", "camera", "drawing", "panel", "gestures", "shading", "harmonics", "lights", "piece", "viewer")
+_FILES = (
+    "common",
+    "camera",
+    "drawing",
+    "panel",
+    "gestures",
+    "style",
+    "frame",
+    "shading",
+    "harmonics",
+    "lights",
+    "piece",
+    "viewer",
+)
 
 
 @functools.cache

@@ -47,18 +47,19 @@ export class Camera {
   }
 }
 
-// Where a ray meets the mesh first: the distance, or infinity.
+// Where a ray meets the mesh first: the distance, or infinity, and the number of the triangle.
 export function meet(origin, way, position, face) {
-  let nearest = Infinity;
+  let nearest = Infinity, triangle = -1;
+  const [dx, dy, dz] = way;
   for (let i = 0; i < face.length; i += 3) {
-    const [a, b, c] = [0, 1, 2].map((k) => position.subarray(3 * face[i + k], 3 * face[i + k] + 3));
-    const e1 = [b[0] - a[0], b[1] - a[1], b[2] - a[2]], e2 = [c[0] - a[0], c[1] - a[1], c[2] - a[2]];
-    const p = cross(way, e2), det = dot(e1, p);
+    const a = 3 * face[i], b = 3 * face[i + 1], c = 3 * face[i + 2], ax = position[a], ay = position[a + 1], az = position[a + 2];
+    const ex = position[b] - ax, ey = position[b + 1] - ay, ez = position[b + 2] - az, fx = position[c] - ax, fy = position[c + 1] - ay, fz = position[c + 2] - az;
+    const px = dy * fz - dz * fy, py = dz * fx - dx * fz, pz = dx * fy - dy * fx, det = ex * px + ey * py + ez * pz;
     if (det === 0) continue;
-    const s = [origin[0] - a[0], origin[1] - a[1], origin[2] - a[2]], u = dot(s, p) / det;
+    const sx = origin[0] - ax, sy = origin[1] - ay, sz = origin[2] - az, u = (sx * px + sy * py + sz * pz) / det;
     if (u < 0 || u > 1) continue;
-    const q = cross(s, e1), v = dot(way, q) / det, t = dot(e2, q) / det;
-    if (v >= 0 && u + v <= 1 && t > 0 && t < nearest) nearest = t;
+    const qx = sy * ez - sz * ey, qy = sz * ex - sx * ez, qz = sx * ey - sy * ex, v = (dx * qx + dy * qy + dz * qz) / det, t = (fx * qx + fy * qy + fz * qz) / det;
+    if (v >= 0 && u + v <= 1 && t > 0 && t < nearest) [nearest, triangle] = [t, i / 3];
   }
-  return nearest;
+  return { distance: nearest, triangle };
 }

@@ -1,6 +1,6 @@
 // Draws the sky, the mesh with colors at its vertices, and pictures at rest.
 
-import { clamp } from "./common.js";
+import { clamp, toLinear } from "./common.js";
 
 const VERTEX = `#version 300 es
 layout(location=0) in vec3 position; layout(location=1) in vec3 color; uniform mat4 matrix; out vec3 c;
@@ -132,10 +132,11 @@ export class Drawing {
     gl.uniform1i(program.at("encoded"), encoded ? 1 : 0);
     gl.uniform1i(program.at("tone"), tone);
   }
-  draw(camera, state, center, now) { // true while a picture at rest appears
-    const gl = this.gl, { width, height } = this.canvas, gain = 2 ** state.stops, tone = TONES.indexOf(state.tone);
+  // The sky and the mesh, on a ground of one color, in the framebuffer of the moment.
+  paint(camera, state, center, { width, height }, ground) {
+    const gl = this.gl, gain = 2 ** state.stops, tone = TONES.indexOf(state.tone);
     gl.viewport(0, 0, width, height);
-    gl.clearColor(0.1, 0.1, 0.1, 1);
+    gl.clearColor(...ground);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.disable(gl.DEPTH_TEST);
     if (state.background && this.skyImage) {
@@ -165,6 +166,10 @@ export class Drawing {
       gl.disable(gl.CULL_FACE);
       gl.disable(gl.DEPTH_TEST);
     }
+  }
+  draw(camera, state, center, now) { // true while a picture at rest appears
+    const gl = this.gl, gain = 2 ** state.stops, tone = TONES.indexOf(state.tone);
+    this.paint(camera, state, center, this.canvas, [0.1, 0.1, 0.1, 1]);
     let alpha = 1;
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
@@ -176,6 +181,51 @@ export class Drawing {
     }
     gl.disable(gl.BLEND);
     return alpha < 1;
+  }
+  // Bytes, RGBA from the lower left, of what is painted at a size of its own. Alpha is 0 where there is only the ground.
+  pixels(camera, state, center, { width, height }) {
+    const gl = this.gl, most = gl.getParameter(gl.MAX_RENDERBUFFER_SIZE), samples = Math.min(4, gl.getParameter(gl.MAX_SAMPLES));
+    if (Math.max(width, height) > most) throw new Error(`a picture must have at most ${most} pixels along an edge in this browser, got ${width} x ${height}`);
+    const buffer = (count, kind, place) => {
+      const made = gl.createRenderbuffer();
+      gl.bindRenderbuffer(gl.RENDERBUFFER, made);
+      gl.renderbufferStorageMultisample(gl.RENDERBUFFER, count, kind, width, height);
+      gl.framebufferRenderbuffer(gl.FRAMEBUFFER, place, gl.RENDERBUFFER, made);
+      return made;
+    };
+    const [many, one] = [gl.createFramebuffer(), gl.createFramebuffer()], result = new Uint8Array(4 * width * height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, many);
+    const buffers = [buffer(samples, gl.RGBA8, gl.COLOR_ATTACHMENT0), buffer(samples, gl.DEPTH_COMPONENT24, gl.DEPTH_ATTACHMENT)];
+    this.paint(camera, state, center, { width, height }, [0, 0, 0, 0]);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, one);
+    buffers.push(buffer(0, gl.RGBA8, gl.COLOR_ATTACHMENT0));
+    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, many);
+    gl.blitFramebuffer(0, 0, width, height, 0, 0, width, height, gl.COLOR_BUFFER_BIT, gl.NEAREST);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, one);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, result);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    for (const frame of [many, one]) gl.deleteFramebuffer(frame);
+    for (const each of buffers) gl.deleteRenderbuffer(each);
+    return result;
+  }
+  // Stops at which the brightest surfaces that are seen come near white, as `jaxprt.image.automatic_exposure` has them:
+  // the 99th percentile of luminance over pixels that surfaces fill is 0.9. Bytes hold it once it is neither white nor
+  // black. Null where no surface is seen, or all is black.
+  exposure(camera, state, center) {
+    const height = 96, width = Math.max(1, Math.round((height * this.canvas.width) / this.canvas.height));
+    for (let stops = 0, tries = 0; tries < 12; tries++) {
+      const pixel = this.pixels(camera, { ...state, stops, tone: TONES[0], background: false }, center, { width, height }), lit = [];
+      for (let i = 0; i < pixel.length; i += 4) {
+        if (pixel[i + 3] < 255) continue;
+        const [r, g, b] = [0, 1, 2].map((c) => toLinear(pixel[i + c] / 255)), luminance = 0.2126 * r + 0.7152 * g + 0.0722 * b;
+        if (luminance > 0) lit.push(luminance);
+      }
+      const bright = lit.sort((x, y) => x - y)[Math.round(0.99 * (lit.length - 1))];
+      if (bright > 0.1 && bright < 0.6) return stops + Math.log2(0.9 / bright);
+      if (bright === undefined && tries > 5) return null; // black, at 2^18 times the light, too
+      stops += bright === undefined ? 3 : bright < 0.6 ? Math.log2(0.3 / bright) : -3;
+    }
+    return null;
   }
   close() { this.gl.getExtension("WEBGL_lose_context")?.loseContext(); }
 }

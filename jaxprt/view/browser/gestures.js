@@ -2,21 +2,44 @@
 
 import { clamp } from "./common.js";
 
-export const HELP = `drag: orbit · right drag or Ctrl: pan · wheel, pinch: zoom · double-click: look at a point
-Shift-drag: turn the light · drop an HDR or EXR file: another light
-arrows: orbit · Shift-arrows: pan · + -: zoom · [ ]: turn the light · , .: exposure · L: next light · S: next system
-B: bounces · G: background · P: picture at rest · E: exact picture · C: clear the lamps · R: reset · H: this help`;
+const keys = (text) => text.split(" ").map((key) => `<kbd>${key}</kbd>`).join(" ");
+export const HINT = {
+  mouse: `drag to orbit, wheel to zoom, ${keys("Shift")}-drag to turn the light, ${keys("H")} for all keys`,
+  touch: "one finger orbits, two zoom and pan, a double tap looks at a point",
+};
+export const HELP = [
+  [`drag, one finger, ${keys("← → ↑ ↓")}`, "orbit"],
+  [`right drag, ${keys("Ctrl")}-drag, two fingers, ${keys("Shift")} ${keys("← → ↑ ↓")}`, "pan"],
+  [`wheel, pinch, ${keys("+ -")}`, "zoom"],
+  ["double-click, double tap", "look at a point, and open its material"],
+  [`${keys("Alt")}-click`, "open the material of a part"],
+  [`${keys("Shift")}-drag, ${keys("[ ]")}`, "turn the light"],
+  [keys("L"), "next light"],
+  ["drop a file", "an HDR or EXR file as another light"],
+  [keys("C"), "remove the suns"],
+  [keys(", ."), "exposure"],
+  [keys("A"), "automatic exposure"],
+  [keys("G"), "background"],
+  [keys("B"), "bounces"],
+  [keys("S"), "next system"],
+  [keys("P"), "fine picture at rest"],
+  [keys("E"), "exact picture at rest"],
+  [keys("R"), "reset"],
+  [keys("H"), "this help"],
+];
 
 export function gestures(canvas, frame, on) {
   const points = new Map();
   let pinch = null;
+  const place = (event) => { const box = canvas.getBoundingClientRect(); return [(2 * (event.clientX - box.left)) / box.width - 1, 1 - (2 * (event.clientY - box.top)) / box.height]; };
   const spot = (event) => [event.clientX, event.clientY];
   const middle = () => { const [a, b] = [...points.values()]; return { at: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], apart: Math.hypot(a[0] - b[0], a[1] - b[1]) || 1 }; };
   const listen = {
     contextmenu: (event) => event.preventDefault(),
     pointerdown(event) {
       if (!on.camera) return;
-      canvas.focus();
+      canvas.focus({ preventScroll: true });
+      if (event.altKey) return on.pick(...place(event));
       canvas.setPointerCapture(event.pointerId);
       points.set(event.pointerId, spot(event));
       pinch = points.size === 2 ? middle() : null;
@@ -40,8 +63,7 @@ export function gestures(canvas, frame, on) {
     pointercancel(event) { points.delete(event.pointerId); pinch = null; },
     dblclick(event) {
       if (!on.camera) return;
-      const box = canvas.getBoundingClientRect();
-      on.lookAt((2 * (event.clientX - box.left)) / box.width - 1, 1 - (2 * (event.clientY - box.top)) / box.height);
+      on.lookAt(...place(event));
     },
     wheel(event) {
       if (!on.camera) return;
@@ -49,14 +71,21 @@ export function gestures(canvas, frame, on) {
       on.camera.zoom(Math.exp(0.001 * clamp(event.deltaY, -300, 300)));
       on.moved();
     },
-    keydown(event) {
-      if (on.camera && !event.altKey && !event.metaKey && !event.ctrlKey && key(event, on)) event.preventDefault();
-    },
+  };
+  // Letters act wherever nothing is typed; arrows, + and - on the picture alone.
+  const typed = (event) => {
+    const from = event.composedPath()[0], elsewhere = from !== canvas;
+    if (!on.camera || event.altKey || event.metaKey || event.ctrlKey || from.closest("dialog, input, select")) return;
+    if (elsewhere && (event.key.length > 1 || "+-= ".includes(event.key)) && !(event.key === "Escape" && !on.help.hidden)) return;
+    if (!key(event, on)) return;
+    event.preventDefault();
+    event.stopPropagation();
   };
   for (const [name, each] of Object.entries(listen)) canvas.addEventListener(name, each, { passive: false });
+  frame.addEventListener("keydown", typed);
   frame.addEventListener("dragover", (event) => event.preventDefault());
   frame.addEventListener("drop", (event) => { event.preventDefault(); if (on.camera && event.dataTransfer.files[0]) on.drop(event.dataTransfer.files[0]); });
-  return () => { for (const [name, each] of Object.entries(listen)) canvas.removeEventListener(name, each); };
+  return () => { for (const [name, each] of Object.entries(listen)) canvas.removeEventListener(name, each); frame.removeEventListener("keydown", typed); };
 }
 
 function key(event, on) {
@@ -74,7 +103,7 @@ function key(event, on) {
       l: () => on.set({ light: (state.light + 1) % scene.lights.length }), s: () => on.set({ system: next, bounces: state.bounces && scene.systems[next].bounces }),
       b: () => scene.systems[state.system].bounces && on.set({ bounces: !state.bounces }), g: () => on.set({ background: !state.background }),
       p: () => on.set({ still: !state.still }), e: () => on.set({ exact: !state.exact }), c: () => on.set({ lamps: [] }), r: () => on.reset(),
-      h: () => { on.help.hidden = !on.help.hidden; },
+      a: () => on.automatic(true), h: () => on.toggleHelp(), escape: () => on.help.hidden || on.toggleHelp(),
     }[event.key.toLowerCase()];
     if (!act) return false;
     act();

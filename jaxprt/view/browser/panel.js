@@ -1,72 +1,166 @@
-// The panel of controls.
+// The panel of controls: the light, the view, and the materials of the parts.
 
 import { clamp, dot, element, half, hex, toDisplay, unhex } from "./common.js";
 import { TONES } from "./drawing.js";
 
-export function panelOf(panel, scene, state, { set, expose, map, moved }) {
+const MANY = 3; // parts from which on their controls are folded
+const FILTER = 10; // parts from which on their names can be searched
+const DEGREE = Math.PI / 180;
+
+const section = (panel, title, open = true, className = "") => {
+  const made = element("details", panel, { open, className });
+  element("summary", made, { textContent: title, title });
+  return made;
+};
+const row = (parent, text) => {
+  const made = element("label", parent, { className: "row" });
+  element("span", made, { textContent: text });
+  return made;
+};
+
+// A slider and a number that can be typed. The slider runs over places, which `at` makes values of and `of` finds again.
+function slider(parent, text, { low, high, step, at = (x) => x, of = (x) => x, digits, title = text, wrap = (x) => clamp(x, low, high) }, pick) {
+  const made = element("div", parent, { className: "row", title });
+  element("span", made, { textContent: text });
+  const [from, to] = [of(low), of(high)].sort((a, b) => a - b), range = element("input", made, { type: "range", min: from, max: to, step: step ?? (to - from) / 200 });
+  const number = element("input", made, { type: "number", step: 10 ** -digits });
+  range.setAttribute("aria-label", text);
+  number.setAttribute("aria-label", `${text}, typed`);
+  range.oninput = () => pick(at(Number(range.value)));
+  number.onchange = () => { if (number.value !== "" && Number.isFinite(Number(number.value))) pick(wrap(Number(number.value))); made.show(made.value); };
+  number.onkeydown = (event) => { if (event.key === "Enter") number.onchange(); };
+  made.show = (value) => {
+    made.value = value;
+    const shown = String(Number(value.toFixed(digits)));
+    if (range.value !== String(of(value))) range.value = of(value);
+    if (number.value !== shown) number.value = shown;
+    range.setAttribute("aria-valuetext", shown);
+  };
+  return made;
+}
+
+export function panelOf(panel, scene, state, { set, expose, automatic, map, moved, open }) {
   panel.textContent = "";
-  const row = (text) => { const made = element("label", panel); element("span", made, { textContent: text }); return made; };
-  const choice = (text, names, pick) => {
-    const made = element("select", row(text));
+  const choice = (parent, text, names, pick) => {
+    const made = element("select", row(parent, text));
     made.fill = (every) => { made.textContent = ""; every.forEach((name, i) => element("option", made, { textContent: name, value: i })); };
     made.fill(names);
     made.onchange = () => pick(Number(made.value));
     return made;
   };
-  const names = Object.keys(scene.systems);
-  const system = names.length > 1 ? choice("system", names, (i) => set({ system: names[i], bounces: state.bounces && scene.systems[names[i]].bounces })) : null;
-  const light = choice("light", scene.lights, (i) => set({ light: i }));
-  const exposure = element("input", row("exposure"), { type: "range", min: -6, max: 6, step: 0.1 });
-  exposure.oninput = () => expose(Number(exposure.value));
-  const tone = choice("tone", TONES, (i) => map(TONES[i]));
-  const box = (text, key, change) => {
-    const made = element("input", row(text), { type: "checkbox" });
-    made.onchange = () => change({ [key]: made.checked });
+  const box = (parent, text, key) => {
+    const label = element("label", panel, { className: "row" });
+    parent.appendChild(label);
+    element("span", label, { className: "long", textContent: text });
+    const made = element("input", label, { type: "checkbox" });
+    made.onchange = () => set({ [key]: made.checked });
     return [key, made];
   };
-  const boxes = [box("background", "background", set)];
-  if (scene.rests.includes("still")) boxes.push(box("picture at rest", "still", set));
-  if (scene.rests.includes("exact")) boxes.push(box("exact picture", "exact", set));
-  if (Object.values(scene.systems).some((each) => each.bounces)) boxes.push(box("bounces", "bounces", set));
-  element("div", panel, { className: "title", textContent: "put a sun by a click, paint light by a drag" });
-  const sky = element("canvas", panel, { className: "sky", width: 256, height: 128 });
-  const tint = element("input", row("its color"), { type: "color", value: "#fff0d8" });
-  const clear = element("button", panel, { textContent: "clear the lamps", type: "button" });
-  clear.onclick = () => set({ lamps: [] });
-  lamps(sky, tint, state, set);
-  const parts = scene.parts.filter((part) => part.free).map((part) => materialOf(panel, part, state, moved));
+
+  const lightPart = section(panel, "Light");
+  const light = choice(lightPart, "light", scene.lights, (i) => set({ light: i }));
+  const sides = { low: -180, high: 180, step: 1, digits: 1, wrap: (x) => ((((x + 180) % 360) + 360) % 360) - 180 };
+  const turn = slider(lightPart, "rotation °", sides, (degrees) => set({ turn: degrees * DEGREE }));
+  const sky = element("canvas", lightPart, { className: "sky", width: 256, height: 128, tabIndex: 0, title: "the light as it is turned; the mark at its lower edge is where the camera looks" });
+  sky.setAttribute("role", "application");
+  sky.setAttribute("aria-label", "the light around the scene: a click or Enter puts a sun, a drag paints light, arrows move the place");
+  element("div", lightPart, { className: "note", textContent: "Click to put a sun, drag to paint light." });
+  const tint = element("input", row(lightPart, "sun color"), { type: "color", value: "#fff0d8" });
+  const buttons = element("div", lightPart, { className: "row" });
+  const clear = element("button", buttons, { textContent: "remove suns", type: "button", className: "clear", onclick: () => set({ lamps: [] }) });
+  const file = element("input", lightPart, { type: "file", accept: ".hdr,.exr,.png,.jpg", hidden: true });
+  file.onchange = () => { if (file.files[0]) open(file.files[0]); file.value = ""; };
+  element("button", buttons, { textContent: "open a light…", type: "button", title: "an HDR or EXR file, which can be dropped on the picture, too", onclick: () => file.click() });
+  const strip = stripOf(sky, tint, state, set);
+
+  const viewPart = section(panel, "View");
+  const names = Object.keys(scene.systems);
+  const system = names.length > 1 ? choice(viewPart, "system", names, (i) => set({ system: names[i], bounces: state.bounces && scene.systems[names[i]].bounces })) : null;
+  const exposure = slider(viewPart, "exposure", { low: -12, high: 12, step: 0.1, digits: 2, wrap: (x) => clamp(x, -20, 20) }, expose);
+  const auto = box(viewPart, "automatic exposure", "auto");
+  auto[1].onchange = () => automatic(auto[1].checked);
+  const tone = choice(viewPart, "tone curve", TONES, (i) => map(TONES[i]));
+  const boxes = [auto, box(viewPart, "background", "background")];
+  if (scene.rests.includes("still")) boxes.push(box(viewPart, "fine picture at rest", "still"));
+  if (scene.rests.includes("exact")) boxes.push(box(viewPart, "exact picture at rest", "exact"));
+  if (Object.values(scene.systems).some((each) => each.bounces)) boxes.push(box(viewPart, "bounces", "bounces"));
+
+  const free = scene.parts.filter((part) => part.free), parts = new Map();
+  const materialPart = free.length ? section(panel, free.length > MANY ? `Materials of ${free.length} parts` : "Materials") : null;
+  if (free.length > FILTER) {
+    const search = element("input", row(materialPart, "find a part"), { type: "text" });
+    search.oninput = () => { for (const [name, part] of parts) part.box.hidden = !name.toLowerCase().includes(search.value.toLowerCase()); };
+  }
+  for (const part of free) parts.set(part.name, materialOf(materialPart, part, state, free.length <= MANY, moved));
   return {
     show() {
       if (light.length !== scene.lights.length) light.fill(scene.lights);
       light.value = state.light;
+      turn.show(sides.wrap(state.turn / DEGREE));
       if (system) system.value = names.indexOf(state.system);
-      exposure.value = state.stops;
+      exposure.show(state.stops);
       tone.value = TONES.indexOf(state.tone);
+      clear.disabled = !state.lamps.length;
       for (const [key, each] of boxes) each.checked = state[key];
-      for (const part of parts) part();
+      for (const part of parts.values()) part.show();
+      strip.show();
     },
-    paint(data, { width, height, scale }) { paintSky(sky, data, width, height, scale, state.stops); },
+    paint: strip.paint,
+    look: strip.look,
+    // Opens the controls of a part, by its name, and marks it.
+    pick(name) {
+      for (const [each, part] of parts) part.box.classList.toggle("picked", each === name);
+      const part = parts.get(name);
+      if (!part) return false;
+      materialPart.open = part.box.open = true;
+      part.box.hidden = false;
+      part.show();
+      part.box.scrollIntoView({ block: "nearest" });
+      return true;
+    },
   };
 }
 
-function paintSky(canvas, data, width, height, scale, stops) {
-  const context = canvas.getContext("2d"), image = context.createImageData(width, height), gain = scale * 2 ** stops;
-  for (let i = 0; i < width * height; i++) {
-    for (let c = 0; c < 3; c++) image.data[4 * i + c] = 255 * toDisplay(clamp(half(data[3 * i + c]) * gain, 0, 1));
-    image.data[4 * i + 3] = 255;
-  }
-  Object.assign(canvas, { width, height });
-  context.putImageData(image, 0, 0);
-}
-
-// Lamps put on the picture of the environment: a click a small bright one, a drag a wide faint one along the way.
-function lamps(canvas, tint, state, set) {
-  const at = (event) => {
-    const box = canvas.getBoundingClientRect();
-    const lon = Math.PI * (1 - (2 * (event.clientX - box.left)) / box.width), lat = Math.PI * (0.5 - (event.clientY - box.top) / box.height);
+// The picture of the environment as it is turned. A click puts a small bright lamp on it, a drag wide faint ones along its way.
+function stripOf(canvas, tint, state, set) {
+  const image = document.createElement("canvas"), width = () => canvas.width, place = { x: 0.5, y: 0.25 };
+  let source = null, drawn = "", azimuth = 0, keys = false;
+  const radiance = () => { // the picture of the unturned light, at the exposure of the moment
+    const { data, scale } = source, gain = scale * 2 ** state.stops, context = image.getContext("2d");
+    const pixel = context.createImageData(image.width, image.height);
+    for (let i = 0; i < image.width * image.height; i++) {
+      for (let c = 0; c < 3; c++) pixel.data[4 * i + c] = 255 * toDisplay(clamp(half(data[3 * i + c]) * gain, 0, 1));
+      pixel.data[4 * i + 3] = 255;
+    }
+    context.putImageData(pixel, 0, 0);
+    drawn = state.stops;
+  };
+  const draw = () => {
+    if (!source) return;
+    if (drawn !== state.stops) radiance();
+    const context = canvas.getContext("2d"), w = width(), left = (((-state.turn / (2 * Math.PI)) % 1) + 1) % 1 * w;
+    for (const x of [left - w, left]) context.drawImage(image, x, 0, w, canvas.height);
+    const x = (((0.5 - (azimuth + Math.PI) / (2 * Math.PI)) % 1) + 1) % 1 * w, y = canvas.height;
+    const mark = (color, size) => { context.fillStyle = color; context.beginPath(); context.moveTo(x - size, y); context.lineTo(x + size, y); context.lineTo(x, y - 1.6 * size); context.fill(); };
+    mark("#000", 7);
+    mark("#fff", 5);
+    if (keys) {
+      for (const [color, size] of [["#000", 3], ["#fff", 1]]) {
+        context.strokeStyle = color;
+        context.lineWidth = size;
+        context.beginPath();
+        context.arc(place.x * w, place.y * canvas.height, 6, 0, 7);
+        context.stroke();
+      }
+    }
+  };
+  // The direction, before the light is turned, of a place in the picture.
+  const direction = (x, y) => {
+    const lon = Math.PI * (1 - 2 * x) - state.turn, lat = Math.PI * (0.5 - y);
     return [Math.cos(lat) * Math.sin(lon), Math.sin(lat), Math.cos(lat) * Math.cos(lon)];
   };
-  const lamp = (direction, angle, strength) => ({ direction, angle, radiance: unhex(tint.value).map((x) => x * strength) });
+  const at = (event) => { const box = canvas.getBoundingClientRect(); return direction((event.clientX - box.left) / box.width, clamp((event.clientY - box.top) / box.height, 0, 1)); };
+  const lamp = (way, angle, strength) => ({ direction: way, angle, radiance: unhex(tint.value).map((x) => x * strength) });
   let last = null, painted = false;
   canvas.onpointerdown = (event) => { canvas.setPointerCapture(event.pointerId); last = at(event); painted = false; };
   canvas.onpointermove = (event) => {
@@ -79,48 +173,110 @@ function lamps(canvas, tint, state, set) {
     if (last && !painted) set({ lamps: [...state.lamps, lamp(at(event), 0.05, 300)] });
     last = null;
   };
+  canvas.onkeydown = (event) => {
+    const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+    if (step) { place.x = (place.x + step[0] / 64 + 1) % 1; place.y = clamp(place.y + step[1] / 32, 0, 1); }
+    else if (event.key === "Enter") set({ lamps: [...state.lamps, lamp(direction(place.x, place.y), 0.05, 300)] });
+    else return;
+    event.preventDefault();
+    event.stopPropagation();
+    draw();
+  };
+  canvas.onfocus = () => { keys = canvas.matches(":focus-visible"); draw(); };
+  canvas.onblur = () => { keys = false; draw(); };
+  return {
+    show: draw,
+    paint(data, { width: w, height: h, scale }) {
+      source = { data, scale };
+      Object.assign(image, { width: w, height: h });
+      if (canvas.width !== w || canvas.height !== h) Object.assign(canvas, { width: w, height: h });
+      drawn = "";
+      draw();
+    },
+    look(angle) { if (angle !== azimuth) { azimuth = angle; draw(); } }, // where the camera stands
+  };
 }
 
-// The plane of roughness and reflectance at normal incidence, and the colors, of one part.
-function materialOf(panel, part, state, moved) {
-  const free = part.free, value = (name) => state.materials[part.name]?.[name] ?? free[name];
+// The controls of one part: by their names in its model, and a plane where roughness and reflectance both act.
+function materialOf(parent, part, state, opened, moved) {
+  const { free } = part, value = (name) => state.materials[part.name]?.[name] ?? free[name];
+  const made = section(parent, part.name, opened, "part");
   const change = (fields) => { state.materials = { ...state.materials, [part.name]: { ...state.materials[part.name], ...fields } }; show(); moved(); };
-  element("div", panel, { className: "title", textContent: part.name });
-  // Of Blinn-Phong the exponent falls to the right, as roughness grows.
-  const across = free.exponent_range ? "exponent" : "roughness", range = free[`${across}_range`], hasPlane = range || free.f0 !== undefined;
-  const low = range?.[0], span = range && range[1] / low;
-  const valueAt = (x) => (across === "exponent" ? low * span ** (1 - x) : low + x * (range[1] - low));
-  const placeOf = (value) => (across === "exponent" ? 1 - Math.log(value / low) / Math.log(span) : (value - low) / (range[1] - low));
-  const plane = hasPlane ? element("canvas", panel, { className: "plane", width: 128, height: 128, title: "roughness to the right (Blinn-Phong: a smaller exponent), reflectance at normal incidence up" }) : null;
-  if (plane) {
-    const drag = (event) => {
-      const area = plane.getBoundingClientRect(), x = clamp((event.clientX - area.left) / area.width, 0, 1), y = clamp(1 - (event.clientY - area.top) / area.height, 0, 1);
-      change({ ...(range && { [across]: valueAt(x) }), ...(free.f0 !== undefined && { f0: y * y }) });
-    };
-    plane.onpointerdown = (event) => { plane.setPointerCapture(event.pointerId); drag(event); };
-    plane.onpointermove = (event) => { if (plane.hasPointerCapture(event.pointerId)) drag(event); };
-  }
-  const pickers = ["diffuse", "specular"].filter((name) => free[name]).map((name) => {
-    const made = element("label", panel);
-    element("span", made, { textContent: name });
-    const input = element("input", made, { type: "color" });
+  const blinn = free.exponent !== undefined, metallic = free.metallic !== undefined, shows = [];
+  const color = (text, name) => {
+    if (!free[name]) return;
+    const input = element("input", row(made, text), { type: "color" });
     input.oninput = () => change({ [name]: unhex(input.value) });
-    return [name, input];
-  });
-  const show = () => {
-    for (const [name, input] of pickers) input.value = hex(value(name));
-    if (!plane) return;
-    const c = plane.getContext("2d"), x = range ? placeOf(value(across)) : 0.5, y = free.f0 !== undefined ? Math.sqrt(value("f0")) : 0.5;
-    c.fillStyle = "#444";
-    c.fillRect(0, 0, 128, 128);
-    c.fillStyle = "#aaa";
-    c.font = "10px sans-serif";
-    c.fillText(across === "exponent" ? "← exponent" : "roughness →", 66, 122);
-    c.fillText("↑ F0", 4, 12);
-    c.fillStyle = "#fd5";
+    shows.push(() => { input.value = hex(value(name)); });
+  };
+  const number = (text, name, options) => {
+    if (free[name] === undefined) return;
+    const control = slider(made, text, { digits: 3, ...options }, (x) => change({ [name]: x }));
+    shows.push(() => control.show(value(name)));
+  };
+  const [low, high] = free.exponent_range ?? free.roughness_range ?? [0, 1], span = high / low;
+  const power = { low, high, digits: 1, at: (x) => low * span ** x, of: (x) => Math.log(x / low) / Math.log(span) };
+  color(metallic || !free.specular ? "base color" : "diffuse color", "diffuse");
+  number("metallic", "metallic", { low: 0, high: 1 });
+  if (free.roughness_range) number("roughness", "roughness", { low, high });
+  if (blinn) number("exponent", "exponent", power);
+  number(blinn ? "specular" : "specular F0", "f0", { title: "reflectance at normal incidence",  low: 0, high: 1, at: (x) => x * x, of: Math.sqrt });
+  color("specular tint", "specular");
+  const across = blinn ? "exponent" : free.roughness_range ? "roughness" : null;
+  // Of Blinn-Phong the exponent falls to the right, as roughness grows. Metals have the base color as their reflectance.
+  if (across && free.f0 !== undefined) shows.push(planeOf(made, { across, low, high, value, change, hidden: () => metallic && value("metallic") >= 1 }));
+  const reset = element("button", element("div", made, { className: "row" }), { type: "button", textContent: "as it was" });
+  reset.onclick = () => { const { [part.name]: _, ...others } = state.materials; state.materials = others; show(); moved(); };
+  shows.push(() => { reset.disabled = !state.materials[part.name]; });
+  const show = () => { if (made.open) for (const each of shows) each(); };
+  made.ontoggle = show;
+  return { box: made, show };
+}
+
+// The plane of roughness and reflectance at normal incidence, whose square root goes up. It is drawn in the theme's colors.
+function planeOf(parent, { across, low, high, value, change, hidden }) {
+  const edge = 264, name = across === "exponent" ? "specular" : "F0", blinn = across === "exponent", margin = 12;
+  const canvas = element("canvas", parent, { className: "plane", width: edge, height: edge, tabIndex: 0, title: `${across} across, ${name} up` });
+  canvas.setAttribute("role", "application");
+  canvas.setAttribute("aria-label", `${across} across and ${name} up; arrows move the point`);
+  const valueAt = (x) => (blinn ? low * (high / low) ** (1 - x) : low + x * (high - low));
+  const placeOf = (v) => (blinn ? 1 - Math.log(v / low) / Math.log(high / low) : (v - low) / (high - low));
+  const put = (x, y) => change({ [across]: valueAt(clamp(x, 0, 1)), f0: clamp(y, 0, 1) ** 2 });
+  const inside = (share) => (share * edge - margin) / (edge - 2 * margin);
+  const drag = (event) => { const area = canvas.getBoundingClientRect(); put(inside((event.clientX - area.left) / area.width), 1 - inside((event.clientY - area.top) / area.height)); };
+  canvas.onpointerdown = (event) => { canvas.setPointerCapture(event.pointerId); drag(event); };
+  canvas.onpointermove = (event) => { if (canvas.hasPointerCapture(event.pointerId)) drag(event); };
+  canvas.onkeydown = (event) => {
+    const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+    if (!step) return;
+    event.preventDefault();
+    event.stopPropagation();
+    put(placeOf(value(across)) + 0.05 * step[0], Math.sqrt(value("f0")) + 0.05 * step[1]);
+  };
+  return () => {
+    canvas.hidden = hidden();
+    const c = canvas.getContext("2d"), style = getComputedStyle(canvas), color = (key) => style.getPropertyValue(key);
+    const x = margin + (edge - 2 * margin) * clamp(placeOf(value(across)), 0, 1), y = edge - margin - (edge - 2 * margin) * Math.sqrt(clamp(value("f0"), 0, 1));
+    c.fillStyle = color("--field");
+    c.fillRect(0, 0, edge, edge);
+    c.strokeStyle = color("--edge");
+    c.lineWidth = 2;
+    for (let k = 0; k <= 4; k++) {
+      const at = margin + ((edge - 2 * margin) * k) / 4;
+      for (const [x0, y0, x1, y1] of [[at, margin, at, edge - margin], [margin, at, edge - margin, at]]) { c.beginPath(); c.moveTo(x0, y0); c.lineTo(x1, y1); c.stroke(); }
+    }
+    c.fillStyle = color("--dim");
+    c.font = "20px system-ui, sans-serif";
+    c.textAlign = "right";
+    c.fillText(blinn ? "← exponent" : `${across} →`, edge - 18, edge - 20);
+    c.textAlign = "left";
+    c.fillText(`↑ ${name}`, 18, 34);
+    c.fillStyle = color("--mark");
+    c.strokeStyle = color("--card");
+    c.lineWidth = 4;
     c.beginPath();
-    c.arc(6 + 116 * x, 122 - 116 * y, 5, 0, 7);
+    c.arc(x, y, 11, 0, 7);
+    c.stroke();
     c.fill();
   };
-  return show;
 }

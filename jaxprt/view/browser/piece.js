@@ -264,11 +264,11 @@ class Piece {
       const most = Math.max(...tint), strength = change.f0 !== undefined ? change.f0 / (own.ior === 0 ? 1 : f0White) : most;
       tint = (change.specular ?? tint.map((x) => x / Math.max(most, 1e-6))).map((x) => x * strength);
     }
-    const base = change?.diffuse ?? own.base_color, f0 = tint.map((x) => Math.min(white * x, 1)), dielectric = 1 - own.metallic, layer = dielectric * own.specular;
+    const base = change?.diffuse ?? own.base_color, f0 = tint.map((x) => Math.min(white * x, 1)), dielectric = 1 - value.metallic, layer = dielectric * own.specular;
     const under = 1 - Math.max(...f0), every = [
       base.map((x) => layer * x * under),
-      f0.map((x, c) => layer * x + own.metallic * base[c]),
-      f0.map((x, c) => layer * (1 - x) + own.metallic * (1 - base[c])),
+      f0.map((x, c) => layer * x + value.metallic * base[c]),
+      f0.map((x, c) => layer * (1 - x) + value.metallic * (1 - base[c])),
       base.map((x) => dielectric * (1 - own.specular) * x),
     ];
     this.write(part, every);

@@ -1,11 +1,12 @@
 // The viewer: mesh and camera live here, colors come from Python. The same module runs in notebooks (anywidget calls
 // `render`) and on a page of its own (`mount`). No libraries.
 
-import { add, clamp, element, half, inflate, unit } from "./common.js";
+import { add, clamp, inflate, unit } from "./common.js";
 import { Camera, meet } from "./camera.js";
 import { Drawing } from "./drawing.js";
 import { panelOf } from "./panel.js";
-import { HELP, gestures } from "./gestures.js";
+import { gestures } from "./gestures.js";
+import { frameOf } from "./frame.js";
 
 const SKY_ROWS = 1024; // of the picture of a light at rest, if its file has so many
 
@@ -14,24 +15,20 @@ const SLOW = 500; // milliseconds of a whole picture from which on a coarse one 
 export function mount(root, ask) {
   const shadow = root.shadowRoot ?? root.attachShadow({ mode: "open" });
   shadow.textContent = "";
-  element("style", shadow, { textContent: STYLE });
-  const frame = element("div", shadow, { className: "frame" });
-  const canvas = element("canvas", frame, { className: "canvas", tabIndex: 0 });
-  canvas.setAttribute("aria-label", "jaxprt viewer; press H for its keys");
-  const panel = element("div", frame, { className: "panel" });
-  const line = element("div", frame, { className: "line" }), told = element("div", frame, { className: "told" });
-  const help = element("pre", frame, { className: "help", textContent: HELP, hidden: true });
-  const state = { system: "", light: 0, turn: 0, lamps: [], stops: 0, tone: "srgb", background: true, bounces: false, still: true, exact: false, materials: {} };
+  root.dataset.lmSuppressShortcuts = "true"; // JupyterLab leaves the keys to the viewer
+  const view = frameOf(shadow, { reset: () => scene && reset(), picture: (size) => picture(size) });
+  const { frame, canvas, panel, line, help, tell, busy } = view;
+  const state = { system: "", light: 0, turn: 0, lamps: [], stops: 0, auto: true, tone: "srgb", background: true, bounces: false, still: true, exact: false, materials: {} };
   const stats = (canvas.stats = { sent: 0, got: 0, errors: 0, stills: 0, coarse: 0, draws: 0, sky: 0, bytes: 0, seq: 0, shown: -1, trip: 0 });
-  let scene = null, camera = null, first = null, drawing = null, closed = false;
+  let scene = null, camera = null, drawing = null, closed = false;
   // Whether round trips are long: the kernel is far away, or the browser draws slowly. Then colors come as bytes, and
   // those that the eye can see first.
   let long = false, bytes = null, partial = false;
+  let exposed = null; // the light that the exposure has been found for, while it is automatic
   let seq = 0, flying = false, dirty = false, wanted = 0, stillTimer = 0, stillBusy = false, skyKey = {}, framed = 0;
   let rest = { size: "", made: 0, ms: 0 }; // whole pictures at rest of one size: how many, and what the last one took
   const viewer = `${Date.now()}-${Math.random()}`; // its name, since each viewer of a session counts its own looks
 
-  const tell = (text) => { told.textContent = text; told.hidden = !text; };
   const resize = () => {
     const ratio = Math.min(window.devicePixelRatio || 1, 2), box = canvas.getBoundingClientRect();
     const width = clamp(Math.round(box.width * ratio), 1, 2048), height = clamp(Math.round(box.height * ratio), 1, 2048);
@@ -45,6 +42,7 @@ export function mount(root, ask) {
     wanted = 0;
     if (!camera || closed || drawing.gl.isContextLost()) return;
     const appears = drawing.draw(camera, state, scene.center, now);
+    controls?.look(camera.azimuth);
     stats.draws++;
     if (appears) redraw();
   };
@@ -67,7 +65,9 @@ export function mount(root, ask) {
     if (flying) { dirty = true; return; }
     if (closed) return;
     [flying, dirty] = [true, false];
-    const began = performance.now(), own = { ...message("look"), vertices: long && bytes ? vertices : "all" };
+    const began = performance.now(), unexposed = state.auto && exposed !== state.light;
+    const own = { ...message("look"), vertices: long && bytes && !unexposed ? vertices : "all" };
+    if (unexposed) own.stops = null; // radiance, of which the exposure is found
     stats.sent++;
     try {
       const { content, buffers } = await ask(own);
@@ -79,10 +79,9 @@ export function mount(root, ask) {
         const data = compressed ? bytes : new Uint16Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 2);
         partial = own.vertices === "seen";
         drawing.setColor(data, compressed, content.scale);
-        if (first === null) {
-          first = compressed ? 0 : exposureFor(data, content.scale);
-          state.stops = first;
-          controls?.show();
+        if (unexposed && state.light === own.light) {
+          exposed = own.light;
+          find();
         }
         stats.trip = performance.now() - began;
         const spent = content.ms.light + content.ms.view + content.ms.combine;
@@ -164,8 +163,20 @@ export function mount(root, ask) {
   };
 
   const set = (fields) => { Object.assign(state, fields); controls?.show(); moved(); };
+  // The exposure for what is seen: at the start, when the light is another one, or when it is asked for.
+  const find = () => {
+    const stops = drawing.exposure(camera, state, scene.center);
+    if (stops !== null) state.stops = Math.round(10 * stops) / 10;
+    controls?.show();
+    if (long) moved(); else redraw();
+  };
+  const automatic = (auto) => {
+    [state.auto, exposed] = [auto, null];
+    controls?.show();
+    if (auto) moved();
+  };
   const expose = (stops) => {
-    state.stops = clamp(stops, -20, 20);
+    [state.auto, state.stops] = [false, clamp(stops, -20, 20)];
     controls?.show();
     if (long) moved(); else redraw();
   };
@@ -183,14 +194,39 @@ export function mount(root, ask) {
       set({ light: content.light, lamps: [] });
     } catch (error) { stats.errors++; tell(`no answer from Python: ${error.message}`); }
   };
-  const reset = () => { camera = new Camera(scene); set({ turn: 0, lamps: [], materials: {}, stops: first ?? 0 }); };
-  const lookAt = (x, y) => {
+  const reset = () => { camera = new Camera(scene); exposed = null; set({ turn: 0, lamps: [], materials: {}, auto: true }); };
+  // What is seen at a place of the picture, from -1 to 1: the point, and the part that it belongs to.
+  const seen = (x, y) => {
     const ray = camera.ray(canvas.clientWidth / canvas.clientHeight);
     const way = unit([0, 1, 2].map((i) => ray[i] * x + ray[3 + i] * y + ray[6 + i])), origin = camera.eye;
-    const t = meet(origin, way, scene.position, scene.face);
-    if (t === Infinity) return;
-    camera.target = add(origin, way, t);
+    const { distance, triangle } = meet(origin, way, scene.position, scene.face);
+    if (triangle < 0) return null;
+    let vertex = scene.face[3 * triangle];
+    return { point: add(origin, way, distance), part: scene.parts.find((part) => (vertex -= part.vertices) < 0) };
+  };
+  const pick = (x, y) => {
+    const part = seen(x, y)?.part;
+    if (!part) return;
+    if (controls.pick(part.name)) view.unfold();
+    tell(part.free ? "" : `the material of ${part.name} cannot change here`);
+  };
+  const lookAt = (x, y) => {
+    const found = seen(x, y);
+    if (!found) return;
+    if (found.part?.free) controls.pick(found.part.name);
+    camera.target = found.point;
     moved();
+  };
+  // A picture of any size as a file: by Python where there is one, else by the graphics card.
+  const picture = async ({ width, height, transparent }) => {
+    if (!scene) throw new Error("there is no scene yet");
+    if (!scene.rests.includes("picture")) return drawn(drawing, camera, { ...state, background: !transparent }, scene.center, width, height);
+    busy(`a picture of ${width} x ${height} pixels`);
+    try {
+      const { content, buffers } = await ask({ ...message("picture"), stops: state.stops, width, height, transparent });
+      if (content.kind === "error") throw new Error(content.message);
+      return new Blob([buffers[0]], { type: "image/png" });
+    } finally { busy(""); }
   };
   let controls = null;
   const start = async () => {
@@ -198,13 +234,13 @@ export function mount(root, ask) {
       const { content, buffers } = await ask({ kind: "scene" });
       if (closed) return;
       if (content.kind === "error") return tell(content.message);
-      const view = (buffer, kind) => new kind(buffer.buffer, buffer.byteOffset, buffer.byteLength / 4);
-      scene = { ...content, position: view(buffers[0], Float32Array), face: view(buffers[1], Uint32Array) };
+      const array = (buffer, kind) => new kind(buffer.buffer, buffer.byteOffset, buffer.byteLength / 4);
+      scene = { ...content, position: array(buffers[0], Float32Array), face: array(buffers[1], Uint32Array) };
       camera ??= new Camera(scene);
       state.system ||= Object.keys(scene.systems)[0];
       state.bounces = scene.systems[state.system].bounces;
       drawing.setMesh(scene.position, scene.face, scene.backs);
-      controls = panelOf(panel, scene, state, { set, expose, map, moved });
+      controls = panelOf(panel, scene, state, { set, expose, automatic, map, moved, open: drop });
       controls.show();
       resize();
       moved();
@@ -214,7 +250,8 @@ export function mount(root, ask) {
     }
   };
   try { drawing = new Drawing(canvas); } catch (error) { tell(error.message); return () => {}; }
-  const hands = gestures(canvas, frame, { get camera() { return camera; }, state, scene: () => scene, set, expose, moved, drop, reset, lookAt, help });
+  const hands = gestures(canvas, frame, { get camera() { return camera; }, state, scene: () => scene, set, expose, automatic, moved, drop, reset, lookAt, pick, help, toggleHelp: view.toggleHelp });
+  frame.addEventListener("theme", () => controls?.show());
   canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); if (!closed) tell("the graphics context was lost; it comes back by itself"); });
   canvas.addEventListener("webglcontextrestored", () => {
     drawing.build();
@@ -227,33 +264,25 @@ export function mount(root, ask) {
   canvas.state = state;
   canvas.camera = () => camera;
   start();
-  return () => { closed = true; watch.disconnect(); hands(); clearTimeout(stillTimer); drawing.close(); };
+  return () => { closed = true; watch.disconnect(); view.close(); hands(); clearTimeout(stillTimer); drawing.close(); };
 }
 
-// Stops for what is seen first: none, unless most of it would be white or black.
-function exposureFor(data, scale) {
-  const value = [], step = 3 * Math.max(1, Math.floor(data.length / 30000));
-  for (let i = 0; i + 2 < data.length; i += step) value.push(scale * Math.max(half(data[i]), half(data[i + 1]), half(data[i + 2])));
-  const lit = value.filter((x) => x > 0).sort((a, b) => a - b), middle = lit[lit.length >> 1] ?? 0.5;
-  return middle > 1 || middle < 0.02 ? clamp(Math.round(10 * Math.log2(0.5 / middle)) / 10, -20, 20) : 0;
+// A picture that the graphics card draws, at twice the size and then reduced, as a PNG file.
+async function drawn(drawing, camera, state, center, width, height) {
+  const large = { width: 2 * width, height: 2 * height }, pixel = drawing.pixels(camera, state, center, large), row = 8 * width;
+  const canvas = Object.assign(document.createElement("canvas"), { width, height }), context = canvas.getContext("2d"), image = context.createImageData(width, height);
+  for (let y = 0, to = 0; y < height; y++) for (let x = 0; x < width; x++, to += 4) {
+    const low = 2 * (height - 1 - y) * row + 8 * x; // rows come from below
+    let alpha = 0;
+    for (const from of [low, low + 4, low + row, low + row + 4]) alpha += pixel[from + 3];
+    for (let c = 0; c < 3; c++) image.data[to + c] = alpha && (255 * (pixel[low + c] + pixel[low + 4 + c] + pixel[low + row + c] + pixel[low + row + 4 + c])) / alpha;
+    image.data[to + 3] = alpha / 4;
+  }
+  context.putImageData(image, 0, 0);
+  const file = await new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
+  if (!file) throw new Error(`this browser cannot make a picture of ${width} x ${height} pixels`);
+  return file;
 }
-
-const STYLE = `
-:host { display: block; height: 100%; }
-.frame { position: relative; display: flex; height: 100%; min-height: 320px; background: #1a1a1a; color: #ddd; font: 12px/1.5 system-ui, sans-serif; }
-.canvas { flex: 1; min-width: 0; width: 100%; height: 100%; touch-action: none; outline: none; }
-.panel { width: 176px; padding: 8px; overflow-y: auto; box-sizing: border-box; background: #262626; }
-.panel label { display: flex; justify-content: space-between; gap: 8px; align-items: center; margin: 2px 0; }
-.panel select, .panel input[type=range] { width: 96px; }
-.title { margin-top: 8px; color: #fd5; }
-.sky, .plane { display: block; width: 160px; touch-action: none; cursor: crosshair; }
-.sky { height: 80px; }
-.plane { height: 128px; width: 128px; }
-.line, .told { position: absolute; left: 8px; pointer-events: none; text-shadow: 0 0 3px #000, 0 0 3px #000; }
-.line { bottom: 6px; right: 184px; }
-.told { top: 6px; max-width: 60%; color: #fd5; }
-.help { position: absolute; left: 8px; top: 28px; margin: 0; padding: 8px; background: #000c; white-space: pre-wrap; max-width: 60%; }
-`;
 
 // For anywidget: messages have numbers, by which answers find their questions.
 function render({ model, el }) {

@@ -1,0 +1,148 @@
+// The frame around the picture: buttons, what is waited for, messages, the hint at the start, the help, and the dialog of pictures.
+
+import { clamp, element } from "./common.js";
+import { HINT, HELP } from "./gestures.js";
+import { STYLE } from "./style.js";
+
+const NARROW = 480; // pixels of the frame up to which the panel lies below the picture, and is folded at first
+
+// Paths of 16 x 16.
+const ICONS = {
+  picture: "M2 5h3l1.5-2h3L11 5h3v8H2zM8 11.2a2.4 2.4 0 1 0 0-4.8 2.4 2.4 0 0 0 0 4.8z",
+  reset: "M3 8a5 5 0 1 0 1.6-3.7M3 2.5v3h3",
+  theme: "M8 13.5a5.5 5.5 0 1 0 0-11zM8 2.5a5.5 5.5 0 0 0 0 11",
+  help: "M5.8 6a2.2 2.2 0 1 1 3.2 2c-.7.4-1 .8-1 1.6M8 12.2v.1",
+  panel: "M2 4.5h6m3 0h3M9.5 3v3M2 11.5h2m3 0h7M5.5 10v3",
+};
+
+// The elements of a viewer in `shadow`. `on` has what its buttons do: `reset`, and `picture` with the size that is chosen.
+export function frameOf(shadow, on) {
+  element("style", shadow, { textContent: STYLE });
+  const frame = element("div", shadow, { className: "frame" }), stage = element("div", frame, { className: "stage" });
+  const canvas = element("canvas", stage, { className: "canvas", tabIndex: 0 });
+  canvas.setAttribute("role", "application");
+  canvas.setAttribute("aria-label", "the scene; press H for the keys");
+  const bar = element("div", stage, { className: "busy", hidden: true });
+  bar.setAttribute("role", "progressbar");
+  const words = element("div", stage, { className: "words" });
+  const waiting = element("div", words, { className: "stagetext", hidden: true });
+  const told = element("div", words, { className: "told", hidden: true });
+  const line = element("div", stage, { className: "line" });
+  for (const each of [waiting, told]) each.setAttribute("role", "status");
+  const hint = element("div", stage, { className: "hint", innerHTML: matchMedia("(pointer: coarse)").matches ? HINT.touch : HINT.mouse });
+  const tools = element("div", stage, { className: "tools" });
+  const panel = element("div", frame, { className: "panel" });
+  panel.setAttribute("role", "region");
+  panel.setAttribute("aria-label", "controls");
+  const help = helpOf(stage);
+  const dialog = dialogOf(frame, canvas, on.picture);
+  const tool = (name, label, act) => {
+    const made = element("button", tools, { type: "button", title: label, onclick: act });
+    made.innerHTML = `<svg viewBox="0 0 16 16" aria-hidden="true"><path d="${ICONS[name]}"/></svg>`;
+    made.setAttribute("aria-label", label);
+    return made;
+  };
+  const started = () => { hint.hidden = true; };
+  const toggleHelp = () => { help.hidden = !help.hidden; started(); if (help.hidden) canvas.focus(); else help.querySelector("button").focus(); };
+  help.querySelector("button").onclick = toggleHelp;
+  tool("picture", "save a picture", () => dialog.open());
+  tool("reset", "reset the view, the light and the materials (R)", on.reset);
+  tool("theme", "dark or light", () => theme(!frame.classList.contains("light")));
+  tool("help", "help (H)", toggleHelp);
+  const unfold = tool("panel", "controls", () => fold(!frame.classList.contains("folded")));
+  const fold = (folded) => { frame.classList.toggle("folded", folded); unfold.setAttribute("aria-pressed", String(!folded)); };
+  const theme = (light) => {
+    frame.classList.toggle("light", light);
+    try { localStorage.setItem("jaxprt-theme", light ? "light" : "dark"); } catch { /* pages without storage forget it */ }
+    frame.dispatchEvent(new Event("theme"));
+  };
+  const preferred = matchMedia("(prefers-color-scheme: light)");
+  let stored = null;
+  try { stored = localStorage.getItem("jaxprt-theme"); } catch { /* likewise */ }
+  frame.classList.toggle("light", stored ? stored === "light" : preferred.matches);
+  preferred.addEventListener("change", (event) => { frame.classList.toggle("light", event.matches); frame.dispatchEvent(new Event("theme")); });
+  fold(false);
+  const watch = new ResizeObserver(() => {
+    const narrow = frame.clientWidth <= NARROW;
+    if (narrow === frame.classList.contains("narrow")) return;
+    frame.classList.toggle("narrow", narrow);
+    fold(narrow);
+  });
+  watch.observe(frame);
+  for (const kind of ["pointerdown", "wheel", "keydown"]) frame.addEventListener(kind, started);
+  return {
+    frame, canvas, panel, line, help, toggleHelp, dialog,
+    unfold() { fold(false); },
+    tell(text) { told.textContent = text; told.hidden = !text; },
+    // What is waited for, and how far it is, from 0 to 1; null where nobody knows. No text: nothing is.
+    busy(text, part = null) {
+      bar.hidden = waiting.hidden = !text;
+      bar.classList.toggle("open", part === null);
+      if (part === null) { bar.style.removeProperty("--part"); bar.removeAttribute("aria-valuenow"); }
+      else { bar.style.setProperty("--part", clamp(part, 0, 1)); bar.setAttribute("aria-valuenow", Math.round(100 * clamp(part, 0, 1))); }
+      bar.setAttribute("aria-label", text || "nothing is waited for");
+      const shown = text && part !== null ? `${text}: ${Math.round(100 * clamp(part, 0, 1))} %` : text || "";
+      if (waiting.textContent !== shown) waiting.textContent = shown;
+    },
+    close() { watch.disconnect(); },
+  };
+}
+
+function helpOf(parent) {
+  const help = element("div", parent, { className: "help", hidden: true });
+  help.setAttribute("role", "dialog");
+  help.setAttribute("aria-label", "help");
+  const head = element("header", help);
+  element("span", head, { textContent: "Mouse, fingers and keys" });
+  element("button", head, { type: "button", textContent: "close" });
+  const table = element("tbody", element("table", help));
+  for (const [keys, what] of HELP) {
+    const row = element("tr", table);
+    element("td", row, { innerHTML: keys });
+    element("td", row, { textContent: what });
+  }
+  return help;
+}
+
+// Asks for the size of a picture, and whether its background is transparent.
+function dialogOf(parent, canvas, make) {
+  const dialog = element("dialog", parent), form = element("form", dialog, { method: "dialog" });
+  dialog.setAttribute("aria-label", "save a picture");
+  element("h2", form, { textContent: "Save a picture" });
+  const field = (text, fields) => {
+    const row = element("label", form, { className: "row" });
+    element("span", row, { textContent: text });
+    return element("input", row, fields);
+  };
+  const number = { type: "number", min: 1, max: 8192, step: 1, required: true };
+  const width = field("width in pixels", number), height = field("height in pixels", number);
+  const clear = field("transparent background", { type: "checkbox" });
+  const note = element("div", form, { className: "note" });
+  note.setAttribute("role", "status");
+  const end = element("div", form, { className: "row end" });
+  const cancel = element("button", end, { type: "button", textContent: "cancel", onclick: () => dialog.close() });
+  const save = element("button", end, { type: "submit", className: "main", textContent: "save PNG" });
+  const lock = (locked) => { for (const each of [width, height, clear, save, cancel]) each.disabled = locked; };
+  form.onsubmit = async (event) => {
+    event.preventDefault();
+    lock(true);
+    note.textContent = "the picture is being made";
+    try {
+      const blob = await make({ width: Number(width.value), height: Number(height.value), transparent: clear.checked });
+      const link = element("a", form, { href: URL.createObjectURL(blob), download: "jaxprt.png" });
+      link.click();
+      link.remove();
+      setTimeout(() => URL.revokeObjectURL(link.href), 60000);
+      dialog.close();
+    } catch (error) { note.textContent = error.message; }
+    lock(false);
+  };
+  return {
+    open() {
+      note.textContent = "";
+      if (!width.value) [width.value, height.value] = [canvas.width, canvas.height];
+      dialog.showModal();
+      width.select();
+    },
+  };
+}
