@@ -45,7 +45,7 @@ tables: $(VENV)/.setup-bench ## the tables of Wang et al. 2004 beside ours, half
 figures: $(VENV)/.setup-bench ## the figures of the papers, into docs/figures: NAME=sun2007_figure_5 for one; more than an hour
 	$(BIN)/python -m benchmarks.figures $(NAME) $(ARGS)
 
-notebooks: $(VENV)/.setup-notebook ## execute the notebooks in place at full size, before a release
+notebooks: $(VENV)/.setup-notebook $(VENV)/.setup-bench ## execute the notebooks in place at full size, before a release
 	@test -n "$(wildcard notebooks/*.ipynb)" || { echo "notebooks/ holds no notebook" >&2; exit 2; }
 	$(BIN)/python notebooks/execute.py $(sort $(wildcard notebooks/*.ipynb))
 

@@ -70,8 +70,11 @@ def measure(glossy: Mesh, ground: Mesh, lights: dict[str, Environment], eye: np.
 
 
 def available() -> bool:
-    """Whether `picture` can run: where drjit finds LLVM 17 or newer, which DRJIT_LIBLLVM_PATH may name."""
-    import drjit
+    """Whether `picture` can run: it needs Mitsuba, and LLVM 17 or newer, which DRJIT_LIBLLVM_PATH may name."""
+    try:
+        import drjit
+    except ImportError:
+        return False
 
     return bool(drjit.has_backend(drjit.JitBackend.LLVM)) and drjit.detail.llvm_version()[0] >= _LLVM
 
