@@ -68,6 +68,12 @@ SYSTEMS = ("planned", *options.NAMES)
     show_default=True,
     help="Tone curve of the PNG files: clamped radiance, or Hable's, AgX or ACES.",
 )
+@option(
+    "--layers",
+    group="Output",
+    type=options.Several(click.Choice(list(outputs.LAYERS))),
+    help="Also write these layers of each picture, as one EXR file without the light behind it.",
+)
 @option("--part", group="Output", metavar="K/N", help="Only precompute the K-th of N parts into a shared --output.")
 @options.folder("Folder for pictures, report.json and precomputed data.", default="output")
 @options.as_json
@@ -116,6 +122,8 @@ def _run(chosen: SimpleNamespace) -> dict[str, Any]:
         candidates |= _precompute(system, view, chosen, plan)
     summary["precompute"] = {system: candidate.cost for system, candidate in candidates.items()}
     _draw(summary, view, candidates, chosen.output)
+    for system, candidate in candidates.items() if chosen.layers else ():
+        report.write_layers(view, system, candidate, chosen.layers, chosen.output)
     for system, candidate in candidates.items() if chosen.animate else ():
         folder = chosen.output / ("animation" if len(candidates) == 1 else f"animation_{system}")
         animation.animate(candidate.system, view, folder, frames=chosen.animate)

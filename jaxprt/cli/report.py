@@ -5,7 +5,7 @@ import itertools
 import math
 import statistics
 import timeit
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -288,6 +288,15 @@ def reflect(view: View, system: str, candidate: SystemScene, stops: dict[str, fl
         total = float(jnp.sum(both - image.sky(light, camera) * pixels.background[..., None]))
         result[name] = float(jnp.sum(both - first)) / total if total > 0 else 0.0
     return result
+
+
+def write_layers(view: View, system: str, candidate: SystemScene, layers: Sequence[str], output: Path) -> None:
+    """Writes a file with layers of the picture for each light, without the light behind it."""
+    names, lights = list(view.lights), list(view.lights.values())
+    for block in candidate.system.picture_blocks(lights, [view.camera], background=None, layers=layers):
+        for number, light in enumerate(block.lights):
+            picture = {name: image[number] for name, image in block.pictures.items()}
+            files.write_exr(output / f"{names[light]}_{system}_layers.exr", picture)
 
 
 def _enlarge(picture: Array, camera: Camera) -> Array:

@@ -3,9 +3,11 @@
 import contextlib
 import os
 import pathlib
+import re
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -18,6 +20,19 @@ from jaxprt.files import pixels
 _PNG_END = b"\0\0\0\0IEND\xae\x42\x60\x82"  # the last chunk, with its checksum
 _INCOMPLETE = "the file is incomplete; the disk may be full"
 _BLOCK = 2**21  # values that are compared per step
+# Channels of the layers of pictures. Blender and Nuke read R, G, B and A as the picture and Z as its depth.
+LAYERS = {
+    "color": ("R", "G", "B"),
+    "alpha": ("A",),
+    "depth": ("Z",),
+    "normal": ("normal.X", "normal.Y", "normal.Z"),
+    "albedo": ("albedo.R", "albedo.G", "albedo.B"),
+    "roughness": ("roughness.V",),
+    "position": ("position.X", "position.Y", "position.Z"),
+    "part": ("part.V",),
+    "direct": ("direct.R", "direct.G", "direct.B"),
+    "reflected": ("reflected.R", "reflected.G", "reflected.B"),
+}
 
 
 def target(path: str | os.PathLike, suffix: str) -> pathlib.Path:
@@ -119,31 +134,63 @@ def _name_error(path: str | os.PathLike, error: OSError) -> OSError:
     return named
 
 
-def write_exr(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"]) -> None:
+def write_exr(
+    path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"] | Mapping[str, np.ndarray | Array]
+) -> None:
     """Writes linear values to an EXR file of 32-bit floats with lossless compression.
 
     Args:
         path: The file, which must end in .exr. An old file is replaced once the new one is complete.
-        image: Linear values with 1 (gray, written as Y), 3 (RGB) or 4 (RGBA) channels.
+        image: Linear values with 1 (gray, written as Y), 3 (RGB) or 4 (RGBA) channels; or the layers of a picture, a
+            dictionary as `RelitScene.picture` returns it, which become one file with several layers. Color, alpha and
+            depth have the names R, G, B, A and Z, and the others names such as "normal.X", so that Blender and Nuke
+            read them. Layers with other names are written as colors, or with the one channel V.
 
     Raises:
-        ValueError: The image is empty, not of a floating-point type, or has another number of channels; or the name
-            does not end in .exr.
+        TypeError: `image` is neither an array nor a dictionary from names to arrays.
+        ValueError: The image is empty, not of a floating-point type, or has another number of channels; the layers have
+            different sizes; or the name does not end in .exr.
         OSError: The file cannot be written. An old file is unchanged.
     """
-    names = _channel_names(image, {1: "Y", 3: "RGB", 4: "RGBA"})
+    if isinstance(image, Mapping):
+        channels = _layer_channels(image)
+    else:
+        names = _channel_names(image, {1: "Y", 3: "RGB", 4: "RGBA"})
+        channels = {name: np.asarray(image, np.float32)[..., i] for i, name in enumerate(names)}
     target(path, ".exr")
     # OpenEXR silently writes wrong values for arrays that are not contiguous.
-    values = np.asarray(image, np.float32)
-    channels = {name: np.ascontiguousarray(values[..., i]) for i, name in enumerate(names)}
+    channels = {name: np.ascontiguousarray(values) for name, values in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with replacing(path) as new:
         try:
-            with OpenEXR.File(header, channels) as file:
+            with OpenEXR.File(header, dict(channels)) as file:  # which replaces the values of the dictionary
                 file.write(str(new))
         except RuntimeError as error:  # also for a full disk
             raise OSError(str(error).replace(str(new), os.fspath(path))) from error
-        _compare(new, values, "float")
+        _compare(new, np.stack(list(channels.values()), -1), "float", names=list(channels))
+
+
+def _layer_channels(layers: Mapping[str, Any]) -> dict[str, Float[np.ndarray, "h w"]]:
+    """The channels of the layers of a picture."""
+    result: dict[str, Any] = {}
+    for name, layer in layers.items():
+        if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9 _-]+", name):
+            raise ValueError(f"names of layers must be of letters, digits, spaces, - and _, got {name!r}")
+        what = f"the layer {name!r}"
+        require.real(what, layer)
+        require.array(what, layer, "h w c", "h w")
+        values = np.asarray(layer, np.float32)
+        values = values[..., None] if values.ndim == 2 else values
+        channels = LAYERS.get(name, [f"{name}.{letter}" for letter in ("RGB" if values.shape[-1] > 1 else "V")])
+        if 0 in values.shape or values.shape[-1] not in (1, len(channels)):
+            raise ValueError(f"{what} must have {len(channels)} channels and a pixel, got {list(np.shape(layer))}")
+        values = np.broadcast_to(values, (*values.shape[:2], len(channels)))
+        result |= {channel: values[..., i] for i, channel in enumerate(channels)}
+    sizes = sorted({values.shape for values in result.values()})
+    if len(sizes) != 1:
+        got = ", ".join(f"{width} x {height}" for height, width in sizes) or "none"
+        raise ValueError(f"the layers of a file must have one size, got {got}")
+    return result
 
 
 def write_png(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"]) -> None:
@@ -192,8 +239,8 @@ def _channel_names(image: Float[np.ndarray | Array, "h w c"], names: dict[int, s
     return names[image.shape[-1]]
 
 
-def _compare(path: pathlib.Path, values: np.ndarray, form: str) -> None:
-    """Raises an OSError if a file does not hold the values, bit by bit."""
+def _compare(path: pathlib.Path, values: np.ndarray, form: str, *, names: Sequence[str] | None = None) -> None:
+    """Raises an OSError if a file does not hold the values, bit by bit; `names` are those of channels in any order."""
     config = OpenImageIO.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
     reader = OpenImageIO.ImageInput.open(str(path), config)
@@ -204,11 +251,14 @@ def _compare(path: pathlib.Path, values: np.ndarray, form: str) -> None:
         spec = reader.spec()
         if (spec.height, spec.width, spec.nchannels) != values.shape:
             raise OSError(_INCOMPLETE)
+        order = list(range(spec.nchannels)) if names is None else [names.index(name) for name in spec.channelnames]
         step = max(16, _BLOCK // (spec.width * spec.nchannels) // 16 * 16)  # EXR has blocks of 16 rows.
         for first in range(0, spec.height, step):
             rows = range(first, min(first + step, spec.height))
             block = pixels.read_block(reader, rows, channels=range(spec.nchannels), form=form)
-            same = block.view(np.uint8) == np.ascontiguousarray(values[rows.start : rows.stop]).view(np.uint8)
+            same = block.view(np.uint8) == np.ascontiguousarray(values[rows.start : rows.stop][..., order]).view(
+                np.uint8
+            )
             if not same.all():
                 raise OSError(_INCOMPLETE)
     except ValueError as error:

@@ -583,3 +583,23 @@ def _tangents(normal: Array, tangent: Array, surface: MaterialValues) -> Array:
     frame = directions.frame(normal, tangent)
     along = jnp.einsum("vi,vij->vj", surface.direction, frame[:, :2], precision="highest")
     return directions.frame(normal, along)[:, 0]
+
+
+def precomputed(shading: Shading) -> Appearance:
+    """The material that a part was precomputed with."""
+    return Appearance(shading.blend, shading.emitted)
+
+
+def is_model(material: Any) -> bool:
+    """Whether a material is a model that is evaluated at vertices and points."""
+    return isinstance(material, Changeable)
+
+
+def check_blend(name: str, shading: Shading, blend: Blend | None) -> None:
+    """Refuses weights of other vertices or channels, and other parameters, than a part has."""
+    before = shading.blend
+    assert before is not None
+    if blend is None or len(blend.parameter) != len(before.parameter):
+        got = "no weights" if blend is None else f"{len(blend.parameter)} parameters"
+        raise ValueError(f"the material of part {name!r} must have {len(before.parameter)} parameters, got {got}")
+    blend.check(len(before.weight), before.weight.shape[1])

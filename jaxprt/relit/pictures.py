@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -21,6 +21,9 @@ from jaxprt.relit import canvas, curvature, lamplight, shadows, tracing
 from jaxprt.relit.casting import caster
 from jaxprt.relit.groups import Arriving, Stage, Surface, look_at, sampled
 from jaxprt.relit.lamplight import LampLight
+from jaxprt.relit.picture_layers import LIGHT
+from jaxprt.relit.picture_layers import check as check_layers
+from jaxprt.relit.picture_layers import of_points as geometry_layers
 from jaxprt.relit.shadows import TexelShares, TracedLight
 from jaxprt.relit.surface import TexelLight, Viewed, radiance, view
 from jaxprt.relit.tracing import Reflections
@@ -83,39 +86,160 @@ class PictureView(eqx.Module):
 
     @promoted
     def picture(
-        self, environment: Environment, *, background: bool = True, between: Between = None
-    ) -> Float[Array, "h w c"]:
-        """Renders the picture under an environment, in linear radiance.
-
-        `background` and `between` are those of `RelitScene.picture`.
+        self,
+        environment: Environment,
+        *,
+        background: str | Environment | None = "light",
+        layers: Sequence[str] | None = None,
+        between: Between = None,
+    ) -> Any:
+        """Renders the picture under an environment, in linear radiance. `RelitScene.picture` explains the options.
 
         Raises:
-            TypeError: `environment` is not an `Environment`.
-            ValueError: The environment is a batch, or has another size than the systems require.
+            TypeError: `environment` is not an `Environment`, or for the reasons of `RelitScene.picture`.
+            ValueError: The environment is a batch, or has another size than the systems require, or for the reasons of
+                `RelitScene.picture`.
         """
-        require.kind("the light", environment, Environment, source="jaxprt.scene.load_environment")
-        require.colors("the light", environment.radiance)
-        if environment.radiance.ndim != 4:
-            raise ValueError(f"a picture needs one light [6, n, n, c], got {list(environment.radiance.shape)}")
-        light = _traced_light(self, environment)
-        arriving = finished(self.arriving(environment, None if light is None else light.rest), between)
+        return self.pictures([environment], background=background, layers=layers, between=between)[0]
+
+    @promoted
+    def pictures(
+        self,
+        environments: Sequence[Environment],
+        *,
+        background: str | Environment | None = "light",
+        layers: Sequence[str] | None = None,
+        between: Between = None,
+    ) -> list[Any]:
+        """What `picture` returns for each of several lights. All that depends on the view is computed once for all."""
+        for environment in environments:
+            _check_light("the light", environment)
+        _check_background(background)
+        names = ("color",) if layers is None else check_layers(layers)
+        shown = [name for name in LIGHT if name in names]
+        lights = [self._light(environment, between) for environment in environments if shown]
+        colors = self._colors(lights, "direct" in shown or "reflected" in shown, between) if shown else []
+        rest = {} if layers is None else self._layers([name for name in names if name not in LIGHT])
+        result = []
+        for number, environment in enumerate(environments):
+            behind = environment if isinstance(background, str) else background
+            of_light = [(index, rows[number]) for index, rows in colors]
+            images = {name: self._image(name, of_light, environment, behind) for name in shown}
+            if layers is not None:
+                result.append({name: images[name] if name in images else rest[name] for name in names})
+            elif background is None:
+                result.append(jnp.concatenate([images["color"], self._alpha()], -1))
+            else:
+                result.append(images["color"])
+        return result
+
+    def remembering(self, arriving: dict[tuple[int, bool], Arriving]) -> "PictureView":
+        """The view with what other views of the scene computed of lights, by environment; these must stay in memory."""
+
+        def known_or_new(environment: Environment, direct: Environment | None) -> Arriving:
+            key = id(environment), direct is None
+            if key not in arriving:
+                arriving[key] = self.arriving(environment, direct)
+            return arriving[key]
+
+        return dataclasses.replace(self, arriving=known_or_new)
+
+    def _light(self, environment: Environment, between: Between) -> "PictureLight":
+        """What arrives under an environment."""
+        traced = _traced_light(self, environment)
+        arriving = finished(self.arriving(environment, None if traced is None else traced.rest), between)
+        reflections = () if self.reflected is None else tuple(_reflections(self, environment, arriving, traced))
+        return PictureLight(arriving, traced, reflections)
+
+    def _colors(
+        self, lights: Sequence["PictureLight"], apart: bool, between: Between
+    ) -> list[tuple[Any, list[tuple[Array, ...]]]]:
+        """Indices of the points of each row, and their colors under each light; if `apart`, also of direct light."""
         lamps = lamplight.of(self.stage, self.pixels, self.camera.width) if self.lamp_rays else None
-        reflected = iter(()) if self.reflected is None else iter(_reflections(self, environment, arriving, light))
-        colors, sharp = environment.radiance.shape[-1], self.stage.sharp_groups
-        recompute = not known(arriving, self.stage, self.camera)
-        rows: list[tuple[Any, Array]] = []
+        recompute = not known([light.arriving for light in lights], self.stage, self.camera)
+        traced, rows = 0, []
         for row in self.rows:
-            added = next(reflected) if row.number in sharp else None
-            color = _color(self, row, arriving, light, lamps, added, recompute=recompute)
-            rows.append((row.index, finished(color, between)))
-            colors = max(colors, color.shape[-1])
-        if background:
-            picture = canvas.sky(environment, self.camera, self.ray, self.pixels.background, colors=colors)
+            sharp = row.number in self.stage.sharp_groups
+            of_row = [light.of_row(traced if sharp else None) for light in lights]
+            traced += sharp
+            colors = _colors_of_row(self, row, of_row, lamps, apart=apart, recompute=recompute)
+            rows.append((row.index, finished(colors, between)))
+        return rows
+
+    def _image(
+        self, name: str, rows: Sequence[tuple[Any, tuple[Array, ...]]], light: Environment, behind: Environment | None
+    ) -> Float[Array, "h w c"]:
+        """The picture, or its direct or reflected light, from the colors of all points."""
+        colors = max([light.radiance.shape[-1], *(part.shape[-1] for _, row in rows for part in row)])
+        if name == "color" and behind is not None:
+            image = canvas.sky(behind, self.camera, self.ray, self.pixels.background, colors=colors)
         else:
-            picture = jnp.zeros((*self.ray.shape[:2], colors), environment.radiance.dtype)
-        for index, color in rows:
-            picture = canvas.draw(picture, self.pixels, index, color)
-        return folded(picture, fold=self.fold)
+            image = jnp.zeros((*self.ray.shape[:2], colors), light.radiance.dtype)
+        for index, (whole, *apart) in rows:
+            part = whole if name == "color" else apart[0] if name == "direct" else whole - apart[0]
+            image = canvas.draw(image, self.pixels, index, part)
+        return folded(image, fold=self.fold)
+
+    def _alpha(self) -> Float[Array, "h w 1"]:
+        """Fraction of each pixel that surfaces hide of the background."""
+        share = jnp.asarray(self.pixels.background)
+        alpha = 1 - (share if share.ndim == 2 else jnp.mean(share, -1))[..., None]
+        return folded(alpha, fold=self.fold)
+
+    def _layers(self, names: Sequence[str]) -> dict[str, Array]:
+        """The layers that do not depend on the light."""
+        result = {"alpha": self._alpha()[..., 0]} if "alpha" in names else {}
+        others = [name for name in names if name != "alpha"]
+        if others:
+            rows = [(row.number, row.index) for row in self.rows]
+            result |= geometry_layers(self.stage, self.pixels, rows, self.camera, others, fold=self.fold)
+        return result
+
+
+class RowLight(eqx.Module):
+    """The light that arrives at the points of a row.
+
+    Attributes:
+        arriving: The light that arrives at the scene, without what is taken out of traced texels.
+        traced: The light with its traced texels; None without.
+        reflections: What reflection rays add; None without.
+    """
+
+    arriving: Arriving
+    traced: TracedLight | None
+    reflections: Float[Array, "p c"] | None
+
+
+class PictureLight(eqx.Module):
+    """The light that arrives at a picture.
+
+    Attributes:
+        arriving: The light that arrives at the scene, without what is taken out of traced texels.
+        traced: The light with its traced texels; None without.
+        reflections: What reflection rays add, for each row of sharp groups.
+    """
+
+    arriving: Arriving
+    traced: TracedLight | None
+    reflections: tuple[Float[Array, "_ c"], ...]
+
+    def of_row(self, number: int | None) -> RowLight:
+        """The light of a row; `number` is its index among the rows of sharp groups, None for others."""
+        return RowLight(self.arriving, self.traced, None if number is None else self.reflections[number])
+
+
+def _check_light(what: str, environment: Any) -> None:
+    require.kind(what, environment, Environment, source="jaxprt.scene.load_environment")
+    require.colors(what, environment.radiance)
+    if environment.radiance.ndim != 4:
+        raise ValueError(f"a picture needs one light [6, n, n, c], got {list(environment.radiance.shape)}")
+
+
+def _check_background(background: Any) -> None:
+    if isinstance(background, Environment):
+        _check_light("the background", background)
+    elif background is not None and (not isinstance(background, str) or background != "light"):
+        raise ValueError(f'background must be "light", an Environment or None, got {require.shown(background)}')
 
 
 def _traced_light(picture: PictureView, environment: Environment) -> TracedLight | None:
@@ -136,35 +260,32 @@ def _reflections(
     return picture.reflected.radiance(picture.stage, whole)
 
 
-def _color(
+def _colors_of_row(
     picture: PictureView,
     row: Row,
-    arriving: Arriving,
-    light: TracedLight | None,
+    lights: Sequence[RowLight],
     lamps: LampLight | None,
-    reflections: Float[Array, "p c"] | None,
     *,
+    apart: bool,
     recompute: bool,
-) -> Float[Array, "*m p c"]:
-    """Colors of the points of a row.
+) -> list[tuple[Float[Array, "*m p c"], ...]]:
+    """Colors of the points of a row under each light.
 
     Args:
         picture: The picture.
         row: The points.
-        arriving: The light that arrives at the scene, without what is taken out of traced texels.
-        light: The light with its traced texels; None without.
+        lights: What arrives at them.
         lamps: The lamps, if rays are traced to them.
-        reflections: What reflection rays add; None without.
+        apart: Whether to give colors of direct light also.
         recompute: Whether derivatives compute again what depends on the view, which needs less memory.
     """
     surface = sampled(picture.stage.surfaces[row.number], row.samples)
     if row.index.ndim == 2:  # of a view that was made inside of `jax.jit`
-        return _color_of_some(picture, row, arriving, light)
+        return [_colors_of_some(picture, row, light, apart=apart) for light in lights]
     if isinstance(row.viewed, Viewed):
-        texels = _texels(row, light, row.index)
-        return radiance(surface, arriving.at(row.number), row.viewed, texels=texels, reflections=reflections)
-    shade = partial(_shaded, picture, surface, row, row.index, lamps)
-    return (jax.checkpoint(shade) if recompute else shade)(arriving, light, reflections)
+        return [_lit(surface, row, row.index, row.viewed, light, apart=apart) for light in lights]
+    shade = partial(_shaded, picture, surface, row, row.index, lamps, apart)
+    return (jax.checkpoint(shade) if recompute else shade)(lights)
 
 
 def _shaded(
@@ -173,33 +294,48 @@ def _shaded(
     row: Row,
     index: Any,
     lamps: LampLight | None,
-    arriving: Arriving,
-    light: TracedLight | None,
-    reflections: Float[Array, "p c"] | None = None,
-) -> Float[Array, "p c"]:
+    apart: bool,
+    lights: Sequence[RowLight],
+) -> list[tuple[Float[Array, "p c"], ...]]:
+    """Colors of some points of a row under each light, with a view that is not stored."""
     points, on_group = _points(picture, index)
     transport = None if lamps is None else lamps.row(row.number, index, on_group)
     seen = _seen(picture.stage, surface, row.number, points, on_group, picture.camera, lamps=transport)
-    texels = _texels(row, light, index)
-    return radiance(surface, arriving.at(row.number), seen, texels=texels, reflections=reflections)
+    return [_lit(surface, row, index, seen, light, apart=apart) for light in lights]
 
 
-def _texels(row: Row, light: TracedLight | None, index: Any) -> TexelLight | None:
-    """The traced texels of the light at points of a row; None without."""
-    return None if light is None else TexelLight(*light.row(index), light.rest.radiance.shape[-2], row.samples)
+def _lit(
+    surface: Surface, row: Row, index: Any, seen: Viewed, light: RowLight, *, apart: bool
+) -> tuple[Float[Array, "p c"], ...]:
+    """Colors of points; if `apart`, also those without reflected light."""
+    texels = None
+    if light.traced is not None:
+        texels = TexelLight(*light.traced.row(index), light.traced.rest.radiance.shape[-2], row.samples)
+    direct, reflected, lamp = light.arriving.at(row.number)
+    color = radiance(surface, (direct, reflected, lamp), seen, texels=texels, reflections=light.reflections)
+    if not apart:
+        return (color,)
+    if reflected is None:
+        return color, color
+    none = jax.tree.map(jnp.zeros_like, reflected)
+    return color, radiance(surface, (direct, none, lamp), seen, texels=texels)
 
 
-def _color_of_some(
-    picture: PictureView, row: Row, arriving: Arriving, light: TracedLight | None
-) -> Float[Array, "m p c"]:
-    """`_color` inside of `jax.jit`, where most rows may be padding alone."""
+def _colors_of_some(
+    picture: PictureView, row: Row, light: RowLight, *, apart: bool
+) -> tuple[Float[Array, "m p c"], ...]:
+    """`_shaded` under one light inside of `jax.jit`, where most rows may be padding alone."""
     surface = sampled(picture.stage.surfaces[row.number], row.samples)
-    shape = jax.eval_shape(lambda: _shaded(picture, surface, row, row.index[0], None, arriving, light))
-    none = jnp.zeros(shape.shape, shape.dtype)
 
-    def some(index: Array) -> Array:
-        shade = jax.checkpoint(partial(_shaded, picture, surface, row, index, None))
-        return jax.lax.cond(jnp.any(index >= 0), shade, lambda *_: none, arriving, light)
+    def shade(index: Array, light: RowLight) -> tuple[Array, ...]:
+        return _shaded(picture, surface, row, index, None, apart, [light])[0]
+
+    shapes = jax.eval_shape(shade, row.index[0], light)
+    none = tuple(jnp.zeros(shape.shape, shape.dtype) for shape in shapes)
+
+    def some(index: Array) -> tuple[Array, ...]:
+        shaded = jax.checkpoint(partial(shade, index))
+        return jax.lax.cond(jnp.any(index >= 0), shaded, lambda _: none, light)
 
     return jax.lax.map(some, row.index)
 

@@ -8,10 +8,10 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Int
 
-from jaxprt.relit import paths
+from jaxprt.relit import curvature, paths
 from jaxprt.relit.channels import Shading
-from jaxprt.relit.groups import Place, joined_mesh
-from jaxprt.relit.recipes import Target, harmonic_table, lobe_table
+from jaxprt.relit.groups import Place, Surface, joined_mesh
+from jaxprt.relit.recipes import Target, harmonic_table, lobe_table, samples_of
 from jaxprt.scene import Environment, Mesh, PointLight
 from jaxprt.scene.mesh import Opacity, frames
 from jaxprt.systems import bounces, lamps
@@ -22,6 +22,7 @@ from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.protocol import System
 from jaxprt.visibility import Run
 
+_TEXELS = 64  # edge of the light's faces for which samples of traced texels are chosen, for systems of any size
 ALL = bounces.build.ALL
 _EACH = 3  # number of bounces that are estimated one by one; further ones are extrapolated as a geometric series
 _EDGE = 8  # largest edge of the faces of light that is reflected
@@ -212,3 +213,17 @@ def needed(reflected: Float[np.ndarray, "b p"], error: float) -> int | str:
     """Smallest number of bounces that omits at most `error` of each part's radiance; "all" if two omit more."""
     enough = np.flatnonzero(np.all(reflected <= error, 1))
     return int(enough[0]) if enough.size else ALL
+
+
+def traits(shading: Shading, surface: Surface) -> tuple[float, int, bool]:
+    """Curvature of a part's radiance, samples of bright texels, and whether its reflections are traced.
+
+    Args:
+        shading: The part with its material.
+        surface: The group that the part belongs to.
+    """
+    size = surface.system.texel_edge or _TEXELS
+    # Powers of two, so that few programs are compiled for parts of different roughness.
+    samples = 1 << (samples_of(shading, size) - 1).bit_length()
+    lobes = None if surface.reflecting is None else surface.reflecting.lobe
+    return curvature.of_part(shading, surface.system), samples, is_sharp(shading, lobes)

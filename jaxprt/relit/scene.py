@@ -2,7 +2,8 @@
 
 import dataclasses
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -16,14 +17,13 @@ from jaxprt import require
 from jaxprt.brdf import grid
 from jaxprt.compile import Between, compile_time, known, promoted, put
 from jaxprt.image import automatic_exposure, pixels, raster
-from jaxprt.relit import channels, curvature, groups, measuring, pictures, reflection, tracing
+from jaxprt.relit import batches, channels, groups, measuring, pictures, reflection, tracing
 from jaxprt.relit import lamps as scene_lamps
 from jaxprt.relit.casting import caster
 from jaxprt.relit.channels import Appearance, Changeable, Shading, appearance
 from jaxprt.relit.groups import Arriving, Place, SceneLight, Stage, Surface, VertexMaterials
 from jaxprt.relit.lamps import SceneLamps
 from jaxprt.relit.pictures import PictureView
-from jaxprt.relit.recipes import samples_of
 from jaxprt.relit.refinement import MeshDivision
 from jaxprt.relit.surface import Viewed, radiance, view_of
 from jaxprt.relit.tracing import Reflections
@@ -37,7 +37,6 @@ from jaxprt.systems import axes, protocol
 from jaxprt.systems.bounces import GroupBounces
 from jaxprt.systems.protocol import Blend, System
 
-_TEXELS = 64  # edge of the light's faces for which samples of traced texels are chosen, for systems of any size
 RAYS = 8  # reflection rays of each vertex or point of a sharp part
 
 
@@ -148,7 +147,7 @@ class RelitScene(System):
         self.mesh, self.points, self.rays = scene.mesh, None, rays
         self.drawn = groups.padded(self.mesh)
         self.table = jax.device_put(material_table.of_parts(self.scene.parts))
-        first = [_precomputed(part) for part in shading]
+        first = [channels.precomputed(part) for part in shading]
         self.appearance = tuple(jax.device_put(place.gathered(number, first)) for number in range(len(systems)))
         self.surfaces = tuple(
             groups.surface(
@@ -162,7 +161,8 @@ class RelitScene(System):
             for number, system in enumerate(systems)
         )
         pairs = zip(shading, place.group, strict=True)
-        curvature, samples, sharp = zip(*(traits(part, self.surfaces[number]) for part, number in pairs), strict=True)
+        traits = (reflection.traits(part, self.surfaces[number]) for part, number in pairs)
+        curvature, samples, sharp = zip(*traits, strict=True)
         self.curvature, self.samples, self.sharp = np.asarray(curvature, self.mesh.position.dtype), samples, sharp
         self.camera = scenes.default_camera(scene, self.mesh)
 
@@ -328,7 +328,7 @@ class RelitScene(System):
     def _stage(self, materials: Mapping[str, Any] | None, appearances: Mapping[str, Appearance]) -> Stage:
         """The scene with given materials, as pictures and reflections take it."""
         of_parts, names = dict(materials or {}), self.scene.names
-        new = {name: material for name, material in of_parts.items() if _is_model(material)}
+        new = {name: material for name, material in of_parts.items() if channels.is_model(material)}
         table, rough = self._tables(new)
         fixed = [name in of_parts and name not in new for name in names]
         unchanged = Appearance(None)
@@ -377,7 +377,7 @@ class RelitScene(System):
             if look.blend is not None and shading.table is not None and known(look):
                 number = self.place.group[part]
                 new = dataclasses.replace(shading, blend=look.blend)
-                rows[part] = traits(new, self.surfaces[number])
+                rows[part] = reflection.traits(new, self.surfaces[number])
         bend, samples, sharp = zip(*rows, strict=True)
         return list(bend), samples, sharp
 
@@ -396,7 +396,9 @@ class RelitScene(System):
         if not any(flags) or self.surfaces[number].scale is None:
             return None
         rows = zip(appearances, fixed, self.shading, strict=True)
-        whole = self.place.gathered(number, [look if flag else _precomputed(shading) for look, flag, shading in rows])
+        whole = self.place.gathered(
+            number, [look if flag else channels.precomputed(shading) for look, flag, shading in rows]
+        )
         dtype = self.mesh.position.dtype
         flag = self.place.column(number, [np.full(*row, dtype) for row in zip(counts, flags, strict=True)])
         emitted = np.zeros((self.place.size[number], 3), dtype) if whole.emitted is None else whole.emitted
@@ -443,15 +445,16 @@ class RelitScene(System):
         materials: Mapping[str, Any] | None = None,
         samples: int = 4,
         shadows: str = "rays",
-        background: bool = True,
+        background: str | Environment | None = "light",
+        layers: Sequence[str] | None = None,
         between: Between = None,
-    ) -> Float[Array, "h w c"]:
+    ) -> Any:
         """Renders the scene under an environment, in linear radiance.
 
         Materials are evaluated and radiance is computed at each pixel.
 
         Args:
-            environment: One environment. It is also the background.
+            environment: One environment.
             camera: The camera; `self.camera` if None.
             materials: Dictionary from names of parts to new materials, in the form that `RelitScene` describes.
             samples: Samples of each pixel: 4, 1 for no anti-aliasing, or 16 for final pictures. 16 takes longer
@@ -459,22 +462,104 @@ class RelitScene(System):
             shadows: "rays" traces shadows of the brightest texels from the points of the picture, so that they are
                 sharp on any mesh. "vertices" interpolates visibility between vertices, which is always done where JAX
                 traces the light or the camera. Rays are constants of derivatives.
-            background: False leaves out the environment where it is seen. Colors are then premultiplied by `coverage`.
+            background: What is seen where no surface is: "light" for the environment, another `Environment`, or None
+                for nothing. Without a background the picture has a last channel, alpha, and its colors are those of the
+                surfaces times alpha, as in EXR files.
+            layers: Names of what to return in a dictionary, instead of the picture alone. "color" is the picture,
+                "direct" the light that comes from the environment and from lamps without a reflection on the way, with
+                what surfaces emit, and "reflected" the rest: color without a background is their sum. "alpha" is the
+                share of each pixel that surfaces hide of the background. "normal" (in world space), "albedo" (the base
+                color; white for a part whose material is a BRDF) and "roughness" are means over all samples of a pixel,
+                with 0 for those that see no surface, as Blender has them and denoisers take them. "depth" (along the
+                direction of view, infinite where nothing is seen), "position" (in world space) and "part" (the index of
+                the part, -1 where nothing is seen) cannot be averaged: they are those of the surface that covers most
+                of the pixel. `jaxprt.files.write_exr` writes all into one file.
             between: Function that is called after each stage and after each block of 8,192 points. If it raises an
                 exception, rendering stops. Not inside `jax.jit`.
 
         Returns:
-            The picture. `jaxprt.image.display` converts it for a screen.
+            The picture, [h, w, c]; or with `layers` a dictionary of arrays [h, w, c], or [h, w] for single numbers.
+            `jaxprt.image.display` converts pictures for a screen.
 
         Raises:
             TypeError: `environment` is not an `Environment`, `camera` is not a `Camera`, or for the reasons that `view`
                 gives.
-            ValueError: The environment is a batch, `samples` is another number, or for the reasons that `view` gives.
+            ValueError: The environment is a batch, `samples` is another number, `background` or `layers` is none of the
+                above, or for the reasons that `view` gives.
         """
         if not isinstance(shadows, str):
             raise TypeError(f'shadows must be "rays" or "vertices", got {require.shown(shadows)}')
         view = self._picture_view(camera, materials, samples=samples, keep=False, shadow=shadows, between=between)
-        return view.picture(environment, background=background, between=between)
+        return view.picture(environment, background=background, layers=layers, between=between)
+
+    @promoted
+    def pictures(
+        self,
+        environments: Sequence[Environment],
+        cameras: Sequence[Camera],
+        *,
+        materials: Mapping[str, Any] | None = None,
+        samples: int = 4,
+        shadows: str = "rays",
+        background: str | Environment | None = "light",
+        layers: Sequence[str] | None = None,
+    ) -> Any:
+        """Renders the scene under each of several lights, seen by each of several cameras of one size.
+
+        It is faster than `picture` in a loop: what depends on the view or the light alone is computed once. Lights of
+        another size than the scene's are resampled, with a warning. `picture` explains the options.
+
+        Returns:
+            Pictures in NumPy, [lights, views, h, w, c]; with `layers` a dictionary of such arrays.
+
+        Raises:
+            TypeError: `environments` or `cameras` is not a list of these, or for the reasons of `picture`.
+            ValueError: A list is empty, the cameras have different sizes, or for the reasons of `picture`.
+            MemoryError: The pictures do not fit into memory; `picture_blocks` gives them one after another.
+        """
+        batches.check_array(environments, cameras, layers)
+        options = {"materials": materials, "samples": samples, "shadows": shadows, "background": background}
+        blocks = self.picture_blocks(environments, cameras, layers=layers, **options)
+        return batches.stacked(blocks, len(environments), len(cameras))
+
+    def picture_blocks(
+        self,
+        environments: Sequence[Environment],
+        cameras: Sequence[Camera],
+        *,
+        materials: Mapping[str, Any] | None = None,
+        samples: int = 4,
+        shadows: str = "rays",
+        background: str | Environment | None = "light",
+        layers: Sequence[str] | None = None,
+        memory: int = 1 << 30,
+    ) -> Iterator[batches.PictureBlock]:
+        """The pictures of `pictures` in blocks, view by view, for any number of lights and cameras of any sizes.
+
+        `memory` is the number of bytes that the pictures of a block may take. A block has one picture at least.
+
+        Returns:
+            Blocks, one after another: the index of the camera, those of the lights, and their pictures in NumPy.
+
+        Raises:
+            TypeError: For the reasons of `pictures`, or `memory` is not a number.
+            ValueError: For the reasons of `pictures`, or `memory` is not positive.
+        """
+        batches.check(environments, cameras)
+        require.number("memory", memory, 0.0, above=True)
+        if not isinstance(shadows, str):
+            raise TypeError(f'shadows must be "rays" or "vertices", got {require.shown(shadows)}')
+        lights = batches.of_one_size(environments, self.light_size)
+        options = {"samples": samples, "keep": False, "shadow": shadows, "between": None}
+        shown = {"background": background, "layers": layers, "memory": int(memory)}
+        view_of = partial(self._picture_view, materials=materials, **options)
+        return batches.blocks(view_of, lights, cameras, **shown)
+
+    @property
+    def light_size(self) -> int | None:
+        """Edge in texels of the faces of lights that the scene was precomputed for; None if it takes any."""
+        sizes = [surface.system.light_size for surface in self.surfaces]
+        return max((size for size in sizes if size is not None), default=None)
 
     @promoted
     def picture_view(
@@ -491,10 +576,9 @@ class RelitScene(System):
         gives the errors.
 
         Args:
-            camera: The camera; `self.camera` if None.
-            materials: Dictionary from names of parts to new materials, in the form that `RelitScene` describes.
-            samples: Samples of each pixel: 4, 1 for no anti-aliasing, or 16 for final pictures. 16 takes longer
-                than 4, and matters where sharp highlights are smaller than a pixel.
+            camera: As for `picture`.
+            materials: As for `picture`.
+            samples: As for `picture`.
             shadows: "rays" and "vertices" as in `picture`. With "rays", texels that earlier lights had in common are
                 not traced again. A light traces its brightest texels now, for all pictures of the view, also inside of
                 `jax.jit`.
@@ -570,8 +654,6 @@ class RelitScene(System):
         require.function("between", options.get("between"))
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
         of_parts = scene_lamps.split(self.lamps, materials)[0]
-        if of_parts is not None and not isinstance(of_parts, Mapping):
-            self.appearances(of_parts)  # raises the error
         appearances = self.appearances(of_parts)
         stage = self._stage(of_parts, appearances)
         arriving = _Lit(self, materials, appearances)
@@ -629,7 +711,9 @@ class RelitScene(System):
         if unknown:
             raise ValueError(f"materials must be for the parts {names}, got one for {unknown[0]!r}")
         result = {}
-        table, rough = self._tables({name: material for name, material in materials.items() if _is_model(material)})
+        table, rough = self._tables(
+            {name: material for name, material in materials.items() if channels.is_model(material)}
+        )
         for name, material in materials.items():
             number = names.index(name)
             part, shading = self.scene.parts[number], self.shading[number]
@@ -640,7 +724,7 @@ class RelitScene(System):
                 )
             kinds, source = (*typing.get_args(Changeable), Appearance, Blend), "jaxprt.scene or RelitScene.appearances"
             require.kind(f"the material of part {name!r}", material, *kinds, source=source)
-            if _is_model(material):
+            if channels.is_model(material):
                 first = int(self.place.first[number])
                 vertex = np.arange(first, first + len(part.mesh.position), dtype=np.int32)
                 look = groups.look_at(table, rough, material_table.at_vertices(vertex))
@@ -648,7 +732,7 @@ class RelitScene(System):
             else:
                 material = self._divided(number, material)
             result[name] = Appearance(material, shading.emitted) if isinstance(material, Blend) else material
-            _check_blend(name, shading, result[name].blend)
+            channels.check_blend(name, shading, result[name].blend)
             if not isinstance(result[name].emitted, Tracer | None) and shading.emitted is None:
                 raise ValueError(
                     f"part {name!r} was precomputed without emission, so light that it emits would not reach other "
@@ -695,27 +779,7 @@ class RelitScene(System):
     def _all(self, appearances: Mapping[str, Appearance]) -> list[Appearance]:
         """The appearance of each part: the given one, or that of the material it was precomputed with."""
         pairs = zip(self.scene.parts, self.shading, strict=True)
-        return [appearances.get(part.name) or _precomputed(shading) for part, shading in pairs]
-
-
-def _precomputed(shading: Shading) -> Appearance:
-    """The material that a part was precomputed with."""
-    return Appearance(shading.blend, shading.emitted)
-
-
-def _is_model(material: Any) -> bool:
-    """Whether a material is a model that is evaluated at vertices and points."""
-    return isinstance(material, Changeable)
-
-
-def _check_blend(name: str, shading: Shading, blend: Blend | None) -> None:
-    """Refuses weights of other vertices or channels, and other parameters, than a part has."""
-    precomputed = shading.blend
-    assert precomputed is not None
-    if blend is None or len(blend.parameter) != len(precomputed.parameter):
-        got = "no weights" if blend is None else f"{len(blend.parameter)} parameters"
-        raise ValueError(f"the material of part {name!r} must have {len(precomputed.parameter)} parameters, got {got}")
-    blend.check(len(precomputed.weight), precomputed.weight.shape[1])
+        return [appearances.get(part.name) or channels.precomputed(shading) for part, shading in pairs]
 
 
 class _Lit(eqx.Module):
@@ -734,17 +798,3 @@ class _Lit(eqx.Module):
         if direct is not None:
             light = SceneLight(groups.direct(self.scene.surfaces, direct), light.transferred)
         return self.scene.shade(light, {**self.appearances, **lights})
-
-
-def traits(shading: Shading, surface: Surface) -> tuple[float, int, bool]:
-    """Curvature of a part's radiance, samples of bright texels, and whether its reflections are traced.
-
-    Args:
-        shading: The part with its material.
-        surface: The group that the part belongs to.
-    """
-    size = surface.system.texel_edge or _TEXELS
-    # Powers of two, so that few programs are compiled for parts of different roughness.
-    samples = 1 << (samples_of(shading, size) - 1).bit_length()
-    lobes = None if surface.reflecting is None else surface.reflecting.lobe
-    return curvature.of_part(shading, surface.system), samples, reflection.is_sharp(shading, lobes)

@@ -521,6 +521,25 @@ def finer(light: Environment, *, size: int = 256) -> Environment:
     return _with_panorama(put(pixels.cubemap(size).astype(light.radiance.dtype)), pixels)
 
 
+def resized(light: Environment, *, size: int) -> Environment:
+    """The same light in texels of another size, with the same integral over the sphere.
+
+    Texels come from the pixels of the light's file as in `finer`, or else from its texels: means of them, or each
+    repeated.
+
+    Raises:
+        ValueError: Neither of the sizes is a multiple of the other, and the light does not have the pixels of a file.
+    """
+    edge = light.radiance.shape[-2]
+    if edge == size or light.panorama is not None:
+        return finer(light, size=size)
+    if edge % size == 0:
+        return Environment(cubemap.reduced(light.radiance, size=size))
+    if size % edge:
+        raise ValueError(f"the edge of a light of {edge} texels must divide {size} or be a multiple of it")
+    return Environment(jnp.repeat(jnp.repeat(light.radiance, size // edge, -3), size // edge, -2))
+
+
 @require.arguments(light=_environment, direction=_direction)
 @jit
 def background(light: Environment, direction: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:

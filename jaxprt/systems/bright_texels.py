@@ -175,6 +175,11 @@ class BrightTexels(VertexSystem):
         return self.system.degree
 
     @property
+    def light_size(self) -> int:
+        """Edge of the faces of the light, whose texels have visibility bit by bit."""
+        return self.visibility.size
+
+    @property
     def texel_edge(self) -> int:
         """Edge of the cubemap faces."""
         return self.visibility.size

@@ -139,6 +139,11 @@ class System(eqx.Module):
         return None
 
     @property
+    def light_size(self) -> int | None:
+        """Edge in texels of the faces of lights that the transport was made for; None if it takes any."""
+        return getattr(self.growing, "size", None)
+
+    @property
     def texel_edge(self) -> int | None:
         """Edge of the cubemap faces whose brightest texels are summed exactly; None if none are."""
         return None

@@ -159,9 +159,9 @@ class Stages:
     ) -> Float[np.ndarray, "h w 4"]:
         """The picture without the environment behind it: linear colors, not premultiplied, and alpha."""
         system, eye = self.system(look), camera(look, width, height)
-        options = {"samples": samples, "background": False, "between": between}
-        color = np.asarray(system.picture(self.environment(look), eye, materials=self.materials(look), **options))
-        alpha = np.asarray(system.coverage(eye, samples=samples))[..., None]
+        options = {"samples": samples, "background": None, "between": between}
+        picture = np.asarray(system.picture(self.environment(look), eye, materials=self.materials(look), **options))
+        color, alpha = picture[..., :-1], picture[..., -1:]
         straight = np.divide(color, alpha, out=np.zeros(color.shape, np.float32), where=alpha > 0)
         return np.concatenate([np.broadcast_to(straight, (height, width, 3)), alpha], -1)
 

@@ -10,6 +10,7 @@ import sys
 import warnings
 
 import numpy as np
+import OpenImageIO
 import pytest
 
 import jaxprt as prt
@@ -29,7 +30,7 @@ f 2 4 3
 
 
 SYSTEMS = ("separable", "harmonic", "lobe")
-WHOLE = ("--ground", "--azimuth", "-30", "--system", ",".join(SYSTEMS))
+WHOLE = ("--ground", "--azimuth", "-30", "--system", ",".join(SYSTEMS), "--layers", "color,alpha,depth")
 
 
 def main(arguments):
@@ -117,12 +118,20 @@ def test_pictures_and_report_are_written(output):
     kinds = ["reference", *SYSTEMS, *(f"{system}_difference" for system in SYSTEMS)]
     names = [f"{light}_{kind}" for light in ("sky", "dusk") for kind in kinds]
     expected = {f"{name}.{suffix}" for name in names for suffix in ("exr", "png")} | {"sky.png", "dusk.png"}
+    expected |= {f"{light}_{system}_layers.exr" for light in ("sky", "dusk") for system in SYSTEMS}
     assert {path.name for path in output.iterdir()} == expected | set(SYSTEMS) | {"report.json"}
     for name in expected:
         assert (output / name).stat().st_size > 50
     picture, _ = prt.files.read_image(output / "sky_harmonic.exr")
     assert picture.shape == (32, 32, 3)
     assert np.isfinite(picture).all()
+    whole = OpenImageIO.ImageInput.open(str(output / "sky_harmonic_layers.exr"))
+    assert whole is not None
+    assert list(whole.spec().channelnames) == ["R", "G", "B", "A", "Z"]
+    layers = np.asarray(whole.read_image("float"))
+    seen = layers[..., 3] == 1
+    assert seen.any()
+    np.testing.assert_allclose(layers[seen][:, :3], picture[seen], rtol=1e-4, atol=1e-5)
 
 
 def test_the_systems_stand_side_by_side_before_the_reference(output):

@@ -217,9 +217,9 @@ def test_a_file_that_does_not_hold_what_was_written_is_not_accepted(tmp_path, mo
     old, compare = path.read_bytes(), outputs._compare
 
     def damaged(change):
-        def check(new, *values):
+        def check(new, *values, **names):
             new.write_bytes(change(new.read_bytes()))
-            compare(new, *values)
+            compare(new, *values, **names)
 
         return check
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 import numpy as np
+import OpenImageIO
 import pytest
 from jax._src import monitoring
 
@@ -369,3 +370,130 @@ def test_points_that_are_none_are_refused():
     alone = Points(jnp.zeros((1, 1), int), jnp.ones((1, 1)))
     with pytest.raises(ValueError, match="three corners"):
         visibility.point_starts(square, alone)
+
+
+def test_color_without_a_background_is_direct_plus_reflected_light(close):
+    ready, names = relit(bounces=1), ["color", "direct", "reflected", "alpha"]
+    layers = ready.picture(light(), CAMERA, background=None, layers=names)
+    assert list(layers) == names
+    close(layers["direct"] + layers["reflected"], layers["color"], tolerance=1e-6)
+    close(layers["direct"], relit().picture(light(), CAMERA, background=None)[..., :3], tolerance=1e-5)
+    assert float(jnp.max(layers["reflected"])) > 0.01
+    close(layers["alpha"], ready.coverage(CAMERA), tolerance=1e-6)
+
+
+def test_the_background_is_what_the_picture_adds_to_its_surfaces(close):
+    ready, sky = relit(), light(3)
+    bare = ready.picture(light(), CAMERA, background=None)
+    behind = ready.picture(light(), CAMERA, background=sky) - bare[..., :3]
+    close(ready.picture(light(), CAMERA, background=light()), ready.picture(light(), CAMERA), tolerance=1e-6)
+    white = ready.picture(light(), CAMERA, background=Environment(jnp.ones((6, SIZE, SIZE, 3)))) - bare[..., :3]
+    close(white, jnp.broadcast_to(1 - bare[..., 3:], white.shape), tolerance=1e-5)
+    assert float(jnp.max(jnp.abs(behind[bare[..., 3] == 1]))) < 1e-6
+
+
+def test_geometric_layers_lie_on_the_rays_of_their_pixels():
+    ready = relit()
+    layers = ready.picture(light(), CAMERA, layers=["position", "depth", "normal", "part"])
+    layers = {name: np.asarray(layer) for name, layer in layers.items()}
+    eye, target = np.array(CAMERA.eye), np.array(CAMERA.target)
+    ahead = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(ahead, [0, 1, 0])
+    right = right / np.linalg.norm(right)
+    seen = layers["part"] >= 0
+    away = layers["position"][seen] - eye
+    forward = away @ ahead
+    np.testing.assert_allclose(layers["depth"][seen], forward, rtol=1e-5)
+    assert np.all(np.isinf(layers["depth"][~seen]))
+    focal = CAMERA.height / 2 / np.tan(CAMERA.field_of_view / 2)
+    row, column = np.nonzero(seen)
+    across = CAMERA.width / 2 + focal * (away @ right) / forward
+    down = CAMERA.height / 2 - focal * (away @ np.cross(right, ahead)) / forward
+    assert np.max(np.abs(across - column - 0.5)) <= 0.5 + 1e-4
+    assert np.max(np.abs(down - row - 0.5)) <= 0.5 + 1e-4
+    ball, floor = layers["part"] == 1, layers["part"] == 0
+    np.testing.assert_allclose(layers["position"][floor][:, 1], 0, atol=1e-5)
+    outward = layers["position"] - [0, 0.7, 0]
+    length = np.linalg.norm(layers["normal"], axis=-1)
+    inside = ball & (length > 0.9)  # means over pixels that the ball fills
+    assert np.count_nonzero(inside) > 10
+    cosine = np.sum(layers["normal"] * outward, -1)[inside] / (length * np.linalg.norm(outward, axis=-1))[inside]
+    assert np.min(cosine) > 0.95
+    assert np.median(cosine) > 0.98
+
+
+def test_albedo_is_the_texture_and_roughness_that_of_the_material():
+    layers = relit().picture(light(), CAMERA, layers=["albedo", "roughness", "part", "alpha"])
+    layers = {name: np.asarray(layer) for name, layer in layers.items()}
+    texels = image().reshape(-1, 3)
+    floor = (layers["part"] == 0) & (layers["alpha"] == 1)
+    assert np.all(layers["albedo"][floor] >= texels.min(0) - 1e-5)
+    assert np.all(layers["albedo"][floor] <= texels.max(0) + 1e-5)
+    assert np.std(layers["albedo"][floor], axis=0).min() > 0.01
+    assert np.all(layers["albedo"][layers["alpha"] == 0] == 0)
+
+
+def test_layers_become_one_file_by_the_names_of_compositors(tmp_path):
+    layers = relit().picture(light(), CAMERA, background=None, layers=["color", "alpha", "depth", "normal", "part"])
+    prt.files.write_exr(tmp_path / "layers.exr", layers)
+    file = OpenImageIO.ImageInput.open(str(tmp_path / "layers.exr"))
+    assert file is not None
+    names = list(file.spec().channelnames)
+    assert names == ["R", "G", "B", "A", "Z", "normal.X", "normal.Y", "normal.Z", "part.V"]
+    values = np.asarray(file.read_image("float"))
+    np.testing.assert_array_equal(values[..., :3], np.asarray(layers["color"]))
+    np.testing.assert_array_equal(values[..., 4], np.asarray(layers["depth"]))
+    np.testing.assert_array_equal(values[..., 8], np.asarray(layers["part"]))
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"layers": "color"}, TypeError, "layers must be a list"),
+        ({"layers": []}, ValueError, "layers must be different ones of color"),
+        ({"layers": ["color", "color"]}, ValueError, "layers must be different"),
+        ({"layers": ["beauty"]}, ValueError, "got 'beauty'"),
+        ({"background": "sky"}, ValueError, 'background must be "light"'),
+    ],
+    ids=str,
+)
+def test_layers_and_backgrounds_that_are_none_are_refused(options, error, words):
+    with pytest.raises(error, match=words):
+        relit().picture(light(), CAMERA, **options)
+
+
+def test_pictures_of_lights_and_cameras_are_those_of_a_loop(close):
+    ready, cameras = relit(bounces=1), [CAMERA, dataclasses.replace(CAMERA, eye=[-1.0, 1.8, 2.4])]
+    lights = [light(1), light(2), light(3)]
+    together = ready.pictures(lights, cameras)
+    assert together.shape == (3, 2, CAMERA.height, CAMERA.width, 3)
+    for number, one in enumerate(lights):
+        for view, camera in enumerate(cameras):
+            close(together[number, view], ready.picture(one, camera), tolerance=1e-6)
+    few = list(ready.picture_blocks(lights, cameras, memory=1, layers=["color", "depth"]))
+    assert [(block.view, list(block.lights)) for block in few] == [(v, [n]) for v in range(2) for n in range(3)]
+    for block in few:
+        close(block.pictures["color"][0], together[block.lights[0], block.view], tolerance=1e-6)
+        assert block.pictures["depth"].shape == (1, CAMERA.height, CAMERA.width)
+
+
+def test_lights_of_other_sizes_are_resampled_with_a_warning(close):
+    ready, fine = relit(), light()
+    twice = Environment(jnp.repeat(jnp.repeat(fine.radiance, 2, 1), 2, 2))
+    with pytest.warns(UserWarning, match="1 of 2 lights have faces of 16 texels"):
+        color = ready.pictures([fine, twice], [CAMERA], background=None)
+    close(color[0], color[1], tolerance=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("lights", "cameras", "error", "words"),
+    [
+        ([], [CAMERA], ValueError, "environments must be at least one"),
+        ([light()], [], ValueError, "cameras must be at least one"),
+        ([light()], [CAMERA, dataclasses.replace(CAMERA, width=9)], ValueError, "one size for one array, got 9 x 16"),
+    ],
+    ids=["no light", "no camera", "two sizes"],
+)
+def test_lights_and_cameras_that_are_none_are_refused(lights, cameras, error, words):
+    with pytest.raises(error, match=words):
+        relit().pictures(lights, cameras)

@@ -112,7 +112,7 @@ def test_a_saved_picture_is_that_of_the_scene_and_its_alpha_is_what_surfaces_cov
     clear, cover = saved(True), np.asarray(scene.coverage(camera, samples=16))
     np.testing.assert_allclose(clear[..., 3], cover, atol=0.6 / 255)
     assert {0.0, 1.0} < set(cover.ravel().tolist())  # and some between them
-    alone = scene.picture(light, camera, samples=16, background=False)
+    alone = scene.picture(light, camera, samples=16, background=None)[..., :3]
     straight = np.asarray(alone)[cover > 0] / cover[cover > 0, None]
     shown = image.display(jnp.asarray(straight), tone="filmic", stops=-1.0)
     np.testing.assert_allclose(clear[cover > 0, :3], shown, atol=0.6 / 255)

@@ -1,0 +1,133 @@
+"""Layers of pictures besides color: coverage, geometry, materials, and light by its way.
+
+Layers that a compositor or a denoiser averages are averaged over the samples of each pixel, as the color is: where
+surfaces cover a part of a pixel, these layers hold that part of their values. Depth, position and part cannot be
+averaged. They are those of the surface that covers most of the pixel.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float, Int
+
+from jaxprt import require
+from jaxprt.files.outputs import LAYERS
+from jaxprt.image.pixels import Pixels
+from jaxprt.relit import canvas
+from jaxprt.relit.groups import Stage, look_at
+from jaxprt.scene import Camera
+
+LIGHT = ("color", "direct", "reflected")  # layers that depend on the light
+_NEAREST = ("depth", "position", "part")  # those of one surface for each pixel
+_SHARE = 1e-3  # of a pixel that a surface must cover to have a depth, a position and a part
+
+
+def check(names: Any) -> tuple[str, ...]:
+    """The names of layers, checked.
+
+    Raises:
+        TypeError: The names are not a list of words.
+        ValueError: There are none, one is unknown, or one comes twice.
+    """
+    if isinstance(names, str) or not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
+        raise TypeError(f'layers must be a list of names such as ["color", "alpha"], got {require.shown(names)}')
+    unknown = [name for name in names if name not in LAYERS]
+    if unknown or not names or len(set(names)) < len(names):
+        got = f"{unknown[0]!r}" if unknown else require.shown(list(names))
+        raise ValueError(f"layers must be different ones of {', '.join(LAYERS)}, got {got}")
+    return tuple(names)
+
+
+def of_points(
+    stage: Stage,
+    pixels: Pixels,
+    rows: Sequence[tuple[int, Any]],
+    camera: Camera,
+    names: Sequence[str],
+    *,
+    fold: int,
+) -> dict[str, Array]:
+    """The layers of a picture that do not depend on the light.
+
+    Args:
+        stage: The scene and its materials.
+        pixels: The points of the picture.
+        rows: Group and indices of the points that are evaluated together; -1 in padding.
+        camera: The camera of the drawn pixels, relative to the origin of the scene.
+        names: Names of layers, without those of light and alpha.
+        fold: Edge in drawn pixels of the squares that are averaged to one pixel of the picture.
+
+    Raises:
+        TypeError: JAX traces the camera or the mesh.
+    """
+    if isinstance(pixels.triangle, Tracer):
+        raise TypeError("layers besides light need a known camera and mesh: make the picture outside of jax.jit")
+    height, width, dtype = camera.height, camera.width, np.asarray(pixels.barycentric).dtype
+    averaged = {name: jnp.zeros((height, width, len(LAYERS[name])), dtype) for name in names if name not in _NEAREST}
+    gray = _gray(pixels)
+    for number, index in rows if averaged else ():
+        values = _materials(stage, pixels, number, index)
+        drawn = {
+            name: jnp.broadcast_to(values[name], (len(index), image.shape[-1])) for name, image in averaged.items()
+        }
+        averaged = {name: canvas.draw(image, gray, index, drawn[name]) for name, image in averaged.items()}
+    result: dict[str, Any] = {name: _mean(image, fold) for name, image in averaged.items()}
+    if any(name in _NEAREST for name in names):
+        result |= _nearest(stage, pixels, camera, names, fold=fold)
+    return {name: image[..., 0] if image.shape[-1] == 1 else image for name, image in result.items()}
+
+
+def _gray(pixels: Pixels) -> Pixels:
+    """The points with one coverage for all colors, as layers of materials have it."""
+    if np.ndim(pixels.coverage) == 1:
+        return pixels
+    return dataclasses.replace(pixels, coverage=np.asarray(pixels.coverage).mean(-1))
+
+
+def _materials(stage: Stage, pixels: Pixels, number: int, index: Int[np.ndarray, " p"]) -> dict[str, Any]:
+    """Normals, base colors and roughness at points of a row."""
+    points, on_group = canvas.points_of(pixels, stage.face, stage.shift, index)
+    look = look_at(stage.table, stage.rough, points)
+    surface = stage.surfaces[number]
+    normal, albedo = on_group.tilted(look.normal).frame(surface.frame)[:, 2], look.values.base_color
+    if surface.scale is None and surface.matte:  # of a BRDF that cannot change
+        albedo = surface.system.view(jnp.zeros(3, normal.dtype), None)
+    return {"normal": normal, "albedo": albedo, "roughness": jnp.exp(look.log_roughness)[:, None]}
+
+
+def _mean(image: Float[Array, "h w c"], fold: int) -> Float[Array, "_ _ c"]:
+    """Means over squares of `fold` x `fold` pixels."""
+    height, width, channels = image.shape
+    return jnp.mean(image.reshape(height // fold, fold, width // fold, fold, channels), (1, 3))
+
+
+def _nearest(stage: Stage, pixels: Pixels, camera: Camera, names: Sequence[str], *, fold: int) -> dict[str, Any]:
+    """Depth, position and part of the surface that covers most of each pixel."""
+    height, width = camera.height, camera.width
+    rows, columns = height // fold, width // fold
+    triangle, coverage = np.asarray(pixels.triangle), np.asarray(_gray(pixels).coverage)
+    real = np.flatnonzero((triangle >= 0) & (coverage > _SHARE))
+    at = np.asarray(pixels.pixel)[real]
+    at = at // width // fold * columns + at % width // fold
+    real, at = (array[np.argsort(coverage[real], kind="stable")] for array in (real, at))
+    point = np.full(rows * columns, -1)
+    point[at] = real  # of equal indices the last one is written
+    seen, chosen = point >= 0, np.maximum(point, 0)
+    corner = stage.face[np.maximum(triangle[chosen], 0)]
+    weight = np.asarray(pixels.barycentric)[chosen]
+    position = np.einsum("pk,pkc->pc", weight, np.asarray(stage.whole.position)[corner])
+    result: dict[str, Any] = {}
+    if "depth" in names:
+        eye, target = np.asarray(camera.eye), np.asarray(camera.target)
+        ahead = (target - eye) / np.linalg.norm(target - eye)
+        result["depth"] = np.where(seen, (position - eye) @ ahead, np.inf)
+    if "part" in names:
+        result["part"] = np.where(seen, stage.part[corner[:, 0]], -1).astype(np.int32)
+    if "position" in names:
+        world = position + np.asarray(stage.whole.origin, position.dtype)
+        result["position"] = np.where(seen[:, None], world, 0)
+    return {name: jnp.asarray(value.reshape(rows, columns, -1)) for name, value in result.items()}
