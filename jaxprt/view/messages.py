@@ -85,9 +85,7 @@ def look(message: Mapping[str, Any], *, systems: Sequence[str], lights: int) -> 
     Raises:
         ValueError: A field is missing, is not a finite number in its range, or names something that does not exist.
     """
-    system = message.get("system")
-    if not isinstance(system, str) or system not in systems:
-        raise ValueError(f"the system must be one of {', '.join(systems)}, got {_shorten(system)}")
+    name = system(message, systems)
     light = message.get("light")
     if type(light) is not int or not 0 <= light < lights:
         raise ValueError(f"the light must be a number from 0 to {lights - 1}, got {_shorten(light)}")
@@ -95,7 +93,7 @@ def look(message: Mapping[str, Any], *, systems: Sequence[str], lights: int) -> 
     if eye == target:
         raise ValueError(f"eye and target must be different points, got {list(eye)} for both")
     return Look(
-        system,
+        name,
         light,
         number(message, "turn", -math.inf, math.inf),
         _lamps(message),
@@ -105,6 +103,14 @@ def look(message: Mapping[str, Any], *, systems: Sequence[str], lights: int) -> 
         truth(message, "bounces"),
         _materials(message.get("materials", {})),
     )
+
+
+def system(message: Mapping[str, Any], systems: Sequence[str]) -> str:
+    """The name of the system that a message requests."""
+    name = message.get("system")
+    if not isinstance(name, str) or name not in systems:
+        raise ValueError(f"the system must be one of {', '.join(systems)}, got {_shorten(name)}")
+    return name
 
 
 def number(message: Mapping[str, Any], name: str, low: float, high: float) -> float:

@@ -23,15 +23,13 @@ from jaxprt.scene import Environment, Mesh
 from jaxprt.view import browser, messages, stages
 from jaxprt.view.content import page_content
 from jaxprt.view.messages import Reply
-from jaxprt.view.reduced import PageScene
+from jaxprt.view.reduced import FIRST, MOST_BYTES, PageScene
 from jaxprt.view.session import Session
 from jaxprt.view.stages import counterclockwise
 
-_MOST_BITS = 2**27  # largest buffer for the visibility of single texels, in bytes, that graphics cards accept
 _SKY_ROWS, _LEAST_SKY_ROWS = 1024, 128  # most rows of a picture of a light; at 128 texels are as good
 _SPARE_OF_SKIES = 4096  # bytes for what the page says of them
 _SPARE = 64  # bytes by which the page's size may change when another error is written into it
-_FIRST = 2  # finest scale of visibility that is stored as bytes
 _SMOOTHEST = 0.25  # least roughness that users of a page can choose: smoother materials vary over a bright texel
 _VIEWS = 4  # views from which the error is measured
 _PAGE = """<!doctype html>
@@ -222,7 +220,7 @@ def export(
     lights = dict(zip(session.stages.name, session.stages.lights, strict=True))
     whole = PageScene.of(scene)
     # Sharp shadows of a small sun matter more than finely averaged visibility.
-    fits = whole.bits is not None and sum(words.size for words in whole.bits) <= _MOST_BITS
+    fits = whole.bits is not None and sum(words.size for words in whole.bits) <= MOST_BYTES
     least = 0
     for texels, size in itertools.product([True, False] if fits else [False], _sizes(whole)):
         reduced = whole.reduced(size.level, texels=texels, degree=size.degree)
@@ -260,7 +258,7 @@ def _sizes(page: PageScene) -> list[_Size]:
     lobes = sum(count for count, held in zip(counts, page.parts, strict=True) if held.scales is not None)
     matrices = [(count, held.degree) for count, held in zip(counts, page.parts, strict=True) if held.degree is not None]
     degree = max((most for _, most in matrices), default=None)
-    level = 0 if scale is None else _FIRST
+    level = 0 if scale is None else FIRST
     result = []
     while True:
         result.append(_Size(level, 0 if scale is None else int(scale.edge[level]), degree))

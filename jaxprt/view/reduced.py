@@ -26,6 +26,8 @@ from jaxprt.systems.lobe.pyramid import Scales
 from jaxprt.systems.protocol import Blend, Exported, System
 from jaxprt.systems.standard.layered import BASE
 
+FIRST = 2  # finest scale of visibility that is stored as bytes
+MOST_BYTES = 2**27  # largest buffer that graphics cards accept
 _GRAY = 0.5  # albedo that stands for a BRDF without a standard table
 _TEXELS = 64  # number of brightest texels that are summed one by one
 
@@ -90,6 +92,27 @@ class PageScene:
         shading = [_base_shading(shading) if has else shading for has, _, shading, _ in rows]
         parts = [part.with_table(standard.METALLIC_ROUGHNESS) if has else part for has, *_, part in rows]
         return cls(scene, shading, parts, seen)
+
+    @classmethod
+    def for_gpu(cls, relit: RelitScene) -> "PageScene":
+        """All that a page can show of a scene, as finely as graphics cards hold it.
+
+        Raises:
+            ValueError: A page cannot show the system of a part, or the light of lamps.
+        """
+        if relit.lamps is not None:
+            raise ValueError("the scene has lamps of its own")
+        if layered := [name for name, row in zip(relit.scene.names, relit.shading, strict=True) if row.layered]:
+            raise ValueError(f"these parts have clear coats or sheens: {', '.join(map(repr, layered))}")
+        page = cls.of(relit.without_bounces())
+        scale, level = page.scales, FIRST
+        if scale is None:
+            return page.reduced(0, texels=False)
+        count = sum(part.vector.shape[1] for part in page.parts if part.scales is not None)
+        while count * int(scale.total - scale.start[level]) > MOST_BYTES and level < len(scale.edge) - 1:
+            level += 1
+        fits = page.bits is not None and sum(words.size for words in page.bits) <= MOST_BYTES
+        return page.reduced(level, texels=fits)
 
     def reduced(self, level: int, *, texels: bool, degree: int | None = None) -> "PageScene":
         """The scene at lower resolution, with vectors and matrices that bytes can hold.

@@ -25,7 +25,9 @@ from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, load_environment, sides
 from jaxprt.scene.mesh import bounds
 from jaxprt.view import messages, stages
+from jaxprt.view.content import light_texels, mip_edges, page_content
 from jaxprt.view.messages import Lamp, Look, Reply
+from jaxprt.view.reduced import PageScene
 from jaxprt.view.stages import Stages
 
 _LARGEST = 2048.0  # most pixels along an edge of a picture
@@ -103,6 +105,7 @@ class Session:
             "picture": self._picture,
             "sky": self._sky,
             "drop": self._drop,
+            "page": self._page,
         }
         kind = message.get("kind")
         kind = kind if isinstance(kind, str) else type(kind).__name__
@@ -165,6 +168,15 @@ class Session:
         content["backs"] = int(np.count_nonzero(~hidden))
         arrays = np.asarray(mesh.position, "<f4"), face[np.argsort(hidden, kind="stable")]
         return Reply(content, [array.tobytes() for array in arrays])
+
+    def _page(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+        """What the browser's GPU shades pixels from, or why it cannot."""
+        name = messages.system(message, list(self.stages.systems))
+        try:
+            content, arrays = page_content(PageScene.for_gpu(self.stages.systems[name]), self.stages.lights)
+        except ValueError as error:
+            return Reply({"kind": "page", "system": name, "missing": str(error)}, [])
+        return Reply(content | {"kind": "page", "system": name}, arrays)
 
     def _parse(self, message: Mapping[str, Any]) -> tuple[Look, int]:
         look = messages.look(message, systems=list(self.stages.systems), lights=len(self.stages.lights))
@@ -279,7 +291,9 @@ class Session:
         with self._lock:
             self.stages.lights.append(light)
             self.stages.name.append(file.stem)
-            return Reply({"kind": "lights", "lights": list(self.stages.name), "light": len(self.stages.name) - 1}, [])
+            texels = light_texels(light, mip_edges(self.stages.size)[0])
+            content = {"kind": "lights", "lights": list(self.stages.name), "light": len(self.stages.name) - 1}
+            return Reply(content, [texels])
 
     def _between(self, message: Mapping[str, Any], seq: int) -> Callable[[], None]:
         """A function to call between the steps of a picture. It raises if the viewer has sent a newer look."""
