@@ -1,10 +1,16 @@
 // Draws the sky, the mesh with colors at its vertices, and pictures at rest.
 
 import { clamp, toLinear } from "./common.js";
+import { WIDTH } from "./shading.js";
+import { drawSides } from "./pixels.js";
 
 const VERTEX = `#version 300 es
 layout(location=0) in vec3 position; layout(location=1) in vec3 color; uniform mat4 matrix; out vec3 c;
 void main(){ c = color; gl_Position = matrix * vec4(position, 1); }`;
+const COLORED = `#version 300 es
+precision highp usampler2D; layout(location=0) in vec3 position; uniform usampler2D color; uniform mat4 matrix; out vec3 c;
+void main(){ uvec2 packed = texelFetch(color, ivec2(gl_VertexID & ${WIDTH - 1}, gl_VertexID >> 12), 0).rg;
+  c = vec3(unpackHalf2x16(packed.r), unpackHalf2x16(packed.g).r); gl_Position = matrix * vec4(position, 1); }`;
 const DISPLAY = `
 uniform float gain; uniform bool encoded; uniform int tone;
 vec3 hable(vec3 x){ return (x * (.15 * x + .05) + .004) / (x * (.15 * x + .5) + .06) - .02 / .3; }
@@ -32,6 +38,9 @@ precision highp float; in vec2 at; out vec4 o; uniform sampler2D image; uniform 
 void main(){ vec3 d = normalize(ray * vec3(at * 2. - 1., 1));
   float lon = atan(d.x, d.z) - turn; vec2 uv = vec2(.5 - lon / 6.283185307, .5 - asin(clamp(d.y, -1., 1.)) / 3.141592654);
   o = vec4(display(textureLod(image, uv, lod).rgb), 1); }`; // of derivatives there would be a seam
+const SHADED = `#version 300 es
+precision highp float; in vec2 at; out vec4 o; uniform sampler2D image; ${DISPLAY}
+void main(){ vec4 c = textureLod(image, at, 0.); o = vec4(display(c.rgb / max(c.a, 1e-3)), c.a); }`; // colors times coverage
 const STILL = `#version 300 es
 precision highp float; in vec2 at; out vec4 o; uniform sampler2D image; uniform float alpha; ${DISPLAY}
 void main(){ o = vec4(display(textureLod(image, vec2(at.x, 1. - at.y), 0.).rgb), alpha); }`;
@@ -43,6 +52,7 @@ const FADE = 200; // milliseconds in which a picture at rest appears
 export class Drawing {
   constructor(canvas) {
     this.canvas = canvas;
+    this.gpu = null; // shades pixels; null where colors come from Python
     const gl = (this.gl = canvas.getContext("webgl2", { alpha: false, antialias: true, preserveDrawingBuffer: true }));
     if (!gl) throw new Error("this browser has no WebGL2, which the viewer needs");
     this.build();
@@ -62,12 +72,15 @@ export class Drawing {
       return { made, at: (name) => gl.getUniformLocation(made, name) };
     };
     this.mesh = program(VERTEX, MESH);
+    this.colored = program(COLORED, MESH);
+    this.shaded = program(QUAD, SHADED);
     this.sky = program(QUAD, SKY);
     this.still = program(QUAD, STILL);
     this.empty = gl.createVertexArray();
     this.array = gl.createVertexArray();
     [this.position, this.color, this.index] = [0, 1, 2].map(() => gl.createBuffer());
     this.skyImage = null;
+    this.gpu?.build();
     this.stills = []; // pictures at rest: the last one appears over the one before
   }
   setMesh(position, face, backs) { // of faces after the first `backs` no backs are seen
@@ -81,7 +94,7 @@ export class Drawing {
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, face, gl.STATIC_DRAW);
     this.count = face.length;
     this.backs = 3 * (backs ?? face.length / 3);
-    this.colored = false;
+    this.drawn = false;
   }
   setColor(data, encoded, scale) {
     const gl = this.gl;
@@ -93,10 +106,11 @@ export class Drawing {
     else gl.vertexAttribPointer(1, 3, gl.HALF_FLOAT, false, 6, 0);
     this.encoded = encoded;
     this.scale = scale;
-    this.colored = true;
+    this.drawn = true;
   }
   texture(data, width, height, encoded, repeat) {
     const gl = this.gl, made = gl.createTexture();
+    gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, made);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     if (encoded) gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, width, height, 0, gl.RGB, gl.UNSIGNED_BYTE, data);
@@ -127,18 +141,19 @@ export class Drawing {
     const gl = this.gl;
     gl.useProgram(program.made);
     gl.bindVertexArray(this.empty);
+    gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, image);
     gl.uniform1f(program.at("gain"), gain);
     gl.uniform1i(program.at("encoded"), encoded ? 1 : 0);
     gl.uniform1i(program.at("tone"), tone);
   }
-  // The sky and the mesh, on a ground of one color, in the framebuffer of the moment.
-  paint(camera, state, center, { width, height }, ground) {
-    const gl = this.gl, gain = 2 ** state.stops, tone = TONES.indexOf(state.tone);
+  // The sky and the mesh, on a ground of one color, in the framebuffer of the moment: an image of shaded pixels, or
+  // colors at vertices without one.
+  paint(camera, state, center, { width, height }, ground, image = null) {
+    const gl = this.gl, gpu = this.gpu, gain = 2 ** state.stops, tone = TONES.indexOf(state.tone);
     gl.viewport(0, 0, width, height);
     gl.clearColor(...ground);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    gl.disable(gl.DEPTH_TEST);
     if (state.background && this.skyImage) {
       this.quad(this.sky, this.skyImage, gain * this.skyScale, false, tone);
       gl.uniformMatrix3fv(this.sky.at("ray"), false, camera.ray(width / height));
@@ -146,33 +161,38 @@ export class Drawing {
       gl.uniform1f(this.sky.at("lod"), Math.log2((2 * Math.tan(camera.angle / 2) * this.skyHeight) / (height * Math.PI)));
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
-    if (this.count && this.colored) {
-      gl.enable(gl.DEPTH_TEST);
-      gl.useProgram(this.mesh.made);
+    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+    if (image) {
+      gl.enable(gl.BLEND);
+      this.quad(this.shaded, image.made, gain, false, tone);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+      gl.disable(gl.BLEND);
+    } else if (this.count && (gpu ? gpu.message : this.drawn)) {
+      const program = gpu ? this.colored : this.mesh;
+      gl.useProgram(program.made);
       gl.bindVertexArray(this.array);
-      gl.uniformMatrix4fv(this.mesh.at("matrix"), false, camera.matrix(width / height, center));
-      gl.uniform1f(this.mesh.at("gain"), gain * this.scale);
-      gl.uniform1i(this.mesh.at("encoded"), this.encoded ? 1 : 0);
-      gl.uniform1i(this.mesh.at("tone"), tone);
-      // Backs lie a little deeper: at silhouettes they are as deep as the fronts beside them, and would show as dots.
-      gl.enable(gl.CULL_FACE);
-      gl.enable(gl.POLYGON_OFFSET_FILL);
-      gl.polygonOffset(2, 4);
-      gl.cullFace(gl.FRONT);
-      gl.drawElements(gl.TRIANGLES, this.backs, gl.UNSIGNED_INT, 0);
-      gl.disable(gl.POLYGON_OFFSET_FILL);
-      gl.cullFace(gl.BACK);
-      gl.drawElements(gl.TRIANGLES, this.count, gl.UNSIGNED_INT, 0);
-      gl.disable(gl.CULL_FACE);
-      gl.disable(gl.DEPTH_TEST);
+      gl.uniformMatrix4fv(program.at("matrix"), false, camera.matrix(width / height, center));
+      gl.uniform1f(program.at("gain"), gpu ? gain : gain * this.scale);
+      gl.uniform1i(program.at("encoded"), !gpu && this.encoded ? 1 : 0);
+      gl.uniform1i(program.at("tone"), tone);
+      if (gpu) gl.uniform1i(program.at("color"), gpu.piece.textures.color.unit);
+      drawSides(gl, this.backs, this.count, (vertices) => gl.drawElements(gl.TRIANGLES, vertices, gl.UNSIGNED_INT, 0));
     }
   }
-  draw(camera, state, center, now) { // true while a picture at rest appears
-    const gl = this.gl, gain = 2 ** state.stops, tone = TONES.indexOf(state.tone);
-    this.paint(camera, state, center, this.canvas, [0.1, 0.1, 0.1, 1]);
+  // Draws a frame: true if another one is to follow. `python` says whether pictures at rest come from there, and `fresh`
+  // whether more has changed than what pixels show.
+  draw(camera, state, center, now, python, fresh) {
+    const { gl, gpu } = this, { width, height } = this.canvas, gain = 2 ** state.stops, tone = TONES.indexOf(state.tone);
+    if (gpu?.busy) {
+      this.late ||= fresh;
+      return true;
+    }
+    const more = gpu?.work(now, camera.matrix(width / height, center), width, height, python) ?? false;
+    if (more && !fresh && !this.late && !gpu.fresh && !this.stills.length) return true;
+    this.late = false;
+    this.paint(camera, state, center, this.canvas, [0.1, 0.1, 0.1, 1], gpu?.shown);
     let alpha = 1;
     gl.enable(gl.BLEND);
-    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
     for (const each of this.stills) {
       alpha = clamp((now - each.since) / FADE, 0, 1);
       this.quad(this.still, each.image, gain * each.scale, each.encoded, tone);
@@ -180,7 +200,7 @@ export class Drawing {
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
     gl.disable(gl.BLEND);
-    return alpha < 1;
+    return more || alpha < 1;
   }
   // Bytes, RGBA from the lower left, of what is painted at a size of its own. Alpha is 0 where there is only the ground.
   pixels(camera, state, center, { width, height }) {
@@ -194,6 +214,7 @@ export class Drawing {
       return made;
     };
     const [many, one] = [gl.createFramebuffer(), gl.createFramebuffer()], result = new Uint8Array(4 * width * height);
+    if (this.gpu) this.gpu.piece.vertices(this.gpu.message);
     gl.bindFramebuffer(gl.FRAMEBUFFER, many);
     const buffers = [buffer(samples, gl.RGBA8, gl.COLOR_ATTACHMENT0), buffer(samples, gl.DEPTH_COMPONENT24, gl.DEPTH_ATTACHMENT)];
     this.paint(camera, state, center, { width, height }, [0, 0, 0, 0]);

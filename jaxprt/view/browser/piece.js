@@ -1,16 +1,16 @@
-// A relit scene without Python: answers the questions of `viewer.js` from what `export` has written, on the GPU.
+// A relit scene on the GPU: its transport, materials and lights, from what Python has written or sent.
 // Diffuse light by transfer vectors; glossy light by lobes and means of visibility, as the lobe system does, or by transfer
 // matrices, as the harmonic system does: harmonics of the visibility are kept, and a light is taken through them once.
 
-import { GATHER, SHADE, WHOLE, WIDTH } from "./shading.js";
+import { ARRIVE, GATHER, SHADE, SIGHT, WHOLE, WIDTH } from "./shading.js";
 import { gathered, harmonics } from "./harmonics.js";
 import { Blur, SIDES, grid, halved, readHdr, rimmed, toCubemap, toHalf, toSky, whole } from "./lights.js";
 
 const FINE = 4; // parts along the edge of a texel by which the rim of a lamp is found
 
-class Piece {
-  constructor(content, buffers) {
-    this.content = content;
+export class Piece {
+  constructor(content, buffers) { // positions and faces come first
+    Object.assign(this, { content, buffers });
     const next = (() => { let i = 0; return (kind) => { const each = buffers[i++]; return new kind(each.buffer, each.byteOffset, each.byteLength / (kind.BYTES_PER_ELEMENT ?? 1)); }; })();
     this.position = next(Float32Array);
     this.face = next(Uint32Array);
@@ -22,99 +22,120 @@ class Piece {
     this.visible = next(Int8Array);
     this.bits = next(Uint8Array);
     this.index = new Map(content.rims.map((edge) => [edge, next(Uint32Array)]));
-    this.lights = content.scene.lights.map(() => next(Float32Array));
-    this.names = [...content.scene.lights];
-    this.skies = (content.skies ?? []).map((sky) => sky && { content: sky, buffers: [next(DataView)] });
-    this.canvas = document.createElement("canvas");
-    this.canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
-    this.build();
+    this.lights = Array.from({ length: content.lights }, () => next(Float32Array));
+    this.count = this.position.length / 3;
   }
-  build() {
-    const gl = (this.gl = this.canvas.getContext("webgl2")), { content } = this;
-    if (!gl) throw new Error("this browser has no WebGL2, which the viewer needs");
-    const bands = Math.max(1, ...content.parts.map((part) => part.bands)), knots = Math.max(2, ...content.parts.map((part) => part.knot.length));
-    const text = SHADE.replaceAll("HARMONICS", 2 * Math.ceil(bands ** 2 / 2)).replaceAll("BANDS", bands).replaceAll("KNOTS", knots).replaceAll("TERMS", content.terms).replaceAll("LEVELS", content.edges.length).replaceAll("WIDTHS", content.light.edges.length).replaceAll("STRIDE", content.stride).replaceAll("TEXELS", Math.max(content.texelEdge, 4));
-    this.program = this.link(text);
-    gl.useProgram(this.program);
-    gl.bindVertexArray(gl.createVertexArray());
-    const count = content.scene.vertices, place = new Float32Array(8 * count);
-    for (let i = 0; i < count; i++) for (let c = 0; c < 3; c++) {
+  build(gl) { // in a context, whose first texture unit stays free
+    const { content } = this;
+    this.gl = gl;
+    this.empty = gl.createVertexArray();
+    this.unit = 1;
+    this.textures = {};
+    const place = new Float32Array(8 * this.count);
+    for (let i = 0; i < this.count; i++) for (let c = 0; c < 3; c++) {
       place[8 * i + c] = this.position[3 * i + c];
       place[8 * i + 4 + c] = this.normal[3 * i + c] / 32767;
     }
-    this.unit = 0;
-    this.textures = {};
+    this.texture("faces", gl.RGB32UI, gl.RGB_INTEGER, gl.UNSIGNED_INT, this.face, 3);
+    const words = (bytes) => new Uint32Array(bytes.buffer, bytes.byteOffset, bytes.length / 4), none = new Float32Array(8);
     this.texture("place", gl.RGBA32F, gl.RGBA, gl.FLOAT, place, 4);
     this.texture("vectors", gl.RGBA8I, gl.RGBA_INTEGER, gl.BYTE, this.vectors, 4);
-    this.texture("pyramid", gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, new Uint32Array(this.pyramid.buffer, this.pyramid.byteOffset, this.pyramid.length / 4), 1);
-    this.texture("bits", gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, new Uint32Array(this.bits.buffer, this.bits.byteOffset, this.bits.length / 4), 1);
+    this.texture("pyramid", gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, words(this.pyramid), 1);
+    this.texture("bits", gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, words(this.bits), 1);
     this.texture("table", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.table, 4);
     this.texture("weights", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.weights, 4);
-    const set = { ints: gl.uniform1iv, floats: gl.uniform1fv };
-    for (const [kind, name, value] of [["ints", "edges", content.edges], ["ints", "starts", content.starts], ["floats", "spreads", content.spreads],
-      ["ints", "lightEdges", content.light.edges], ["ints", "lightStarts", content.light.starts], ["floats", "lightSpreads", content.light.spreads]]) set[kind].call(gl, this.at(name), value);
-    this.arrived = this.target(content.arrived, this.unit++);
-    gl.uniform1i(this.at("arrived"), this.unit - 1);
-    this.color = this.target(count, this.unit++);
-    if (content.arrived) {
-      this.gather = this.link(GATHER);
-      this.texture("visible", gl.RGBA8I, gl.RGBA_INTEGER, gl.BYTE, this.visible, 4, this.gather);
+    this.texture("visible", gl.RGBA8I, gl.RGBA_INTEGER, gl.BYTE, this.visible, 4);
+    for (const name of ["light", "bright", "gathered"]) this.texture(name, gl.RGBA32F, gl.RGBA, gl.FLOAT, none, 4);
+    this.sights = Math.ceil(content.texels / 16) || 1;
+    const shadows = content.visibility;
+    this.arriving = this.target("arriving", shadows ? this.count : 0);
+    this.sight = this.target("sight", shadows && content.texels ? this.count * this.sights : 0);
+    this.arrived = this.target("arrived", content.arrived);
+    this.color = this.target("color", this.count);
+    const bands = Math.max(1, ...content.parts.map((part) => part.bands)), knots = Math.max(2, ...content.parts.map((part) => part.knot.length));
+    const sizes = { SHADOWS: shadows ? 1 : 0, SIGHTS: this.sights, HARMONICS: 2 * Math.ceil(bands ** 2 / 2), BANDS: bands, KNOTS: knots, TERMS: content.terms, LEVELS: content.edges.length, WIDTHS: content.light.edges.length, STRIDE: content.stride, TEXELS: Math.max(content.texelEdge, 4) };
+    const sized = (text, corners) => Object.entries({ ...sizes, CORNERS: corners }).reduce((result, [name, value]) => result.replaceAll(name, value), text);
+    this.programs = { vertex: sized(SHADE, 1), pixel: sized(SHADE, 3), arrive: sized(ARRIVE), sight: sized(SIGHT), gather: GATHER };
+    for (const [name, text] of Object.entries(this.programs)) this.programs[name] = this.link(WHOLE, text);
+    const lists = { edges: content.edges, starts: content.starts, lightEdges: content.light.edges, lightStarts: content.light.starts };
+    for (const program of [this.programs.vertex, this.programs.pixel]) {
+      gl.useProgram(program);
+      for (const [name, list] of Object.entries(lists)) gl.uniform1iv(this.at(name, program), list);
+      gl.uniform1fv(this.at("spreads", program), content.spreads);
+      gl.uniform1fv(this.at("lightSpreads", program), content.light.spreads);
     }
-    this.degree = Math.max(Math.round(Math.sqrt(content.vectorUnit.length)), ...content.parts.map((part) => part.bands)) - 1;
-    this.use(this.program, this.color);
+    this.degree = Math.max(Math.round(Math.sqrt(content.vectorUnit.length)), 1, ...content.parts.map((part) => part.bands)) - 1;
     for (const part of content.parts) part.written = "";
-    [this.lit, this.turned] = ["", ""];
+    [this.lit, this.turned, this.colored] = ["", "", null];
   }
-  link(text) {
+  close() {
+    const { gl } = this;
+    for (const { made, frame } of Object.values(this.textures)) { gl.deleteTexture(made); if (frame) gl.deleteFramebuffer(frame); }
+    for (const program of Object.values(this.programs)) gl.deleteProgram(program);
+    gl.deleteVertexArray(this.empty);
+  }
+  link(vertex, fragment) {
     const gl = this.gl, program = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, WHOLE], [gl.FRAGMENT_SHADER, text]]) {
+    for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
       const shader = gl.createShader(kind);
       gl.shaderSource(shader, source);
       gl.compileShader(shader);
-      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) throw new Error(gl.getShaderInfoLog(shader));
       gl.attachShader(program, shader);
     }
     gl.linkProgram(program);
+    gl.useProgram(program);
+    for (const [name, { unit }] of Object.entries(this.textures)) gl.uniform1i(this.at(name, program), unit);
     return program;
   }
-  // A texture of so many entries that is drawn into.
-  target(entries, unit) {
-    const gl = this.gl, made = gl.createTexture(), frame = gl.createFramebuffer(), rows = Math.max(1, Math.ceil(entries / WIDTH));
-    this.check(rows);
-    gl.activeTexture(gl.TEXTURE0 + unit);
-    gl.bindTexture(gl.TEXTURE_2D, made);
-    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, WIDTH, rows);
+  allocate(name, internal, entries) {
+    const gl = this.gl, rows = Math.max(1, Math.ceil(entries / WIDTH)), most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    if (rows > most) throw new Error(`this browser has textures of ${most} rows, and the scene needs ${rows}`);
+    const held = (this.textures[name] ??= { unit: this.unit++ });
+    gl.activeTexture(gl.TEXTURE0 + held.unit);
+    if (held.rows === rows) return held;
+    gl.deleteTexture(held.made ?? null);
+    gl.bindTexture(gl.TEXTURE_2D, (held.made = gl.createTexture()));
+    gl.texStorage2D(gl.TEXTURE_2D, 1, internal, WIDTH, rows);
     for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, made, 0);
-    return { frame, rows };
+    held.rows = rows;
+    return held;
+  }
+  // A texture of so many entries that is drawn into.
+  target(name, entries) {
+    const gl = this.gl, held = this.allocate(name, gl.RGBA32UI, entries);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, (held.frame = gl.createFramebuffer()));
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, held.made, 0);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    return held;
+  }
+  texture(name, internal, format, type, data, channels) {
+    const gl = this.gl, entries = data.length / channels, full = Math.floor(entries / WIDTH), rest = entries - full * WIDTH;
+    this.allocate(name, internal, entries);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    if (full) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, full, format, type, data.subarray(0, full * WIDTH * channels));
+    if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, full, rest, 1, format, type, data.subarray(full * WIDTH * channels));
   }
   use(program, target) {
     const gl = this.gl;
     gl.useProgram(program);
+    gl.bindVertexArray(this.empty);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.frame);
     gl.viewport(0, 0, WIDTH, target.rows);
+    gl.enable(gl.SCISSOR_TEST);
   }
-  check(rows) {
-    const most = this.gl.getParameter(this.gl.MAX_TEXTURE_SIZE);
-    if (rows > most) throw new Error(`this browser has textures of ${most} rows, and the scene needs ${rows}`);
+  // Draws the rows of a target in which some entries lie.
+  over(start, count) {
+    const gl = this.gl, row = Math.floor(start / WIDTH);
+    gl.scissor(0, row, WIDTH, Math.ceil((start + count) / WIDTH) - row);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
-  at(name, program = this.program) { return placeOf(this.gl, program, name); }
-  texture(name, internal, format, type, data, channels, program = this.program) {
-    const gl = this.gl, entries = data.length / channels, rows = Math.max(1, Math.ceil(entries / WIDTH));
-    this.check(rows);
-    const unit = (this.textures[name] ??= { unit: this.unit++ }).unit;
-    gl.activeTexture(gl.TEXTURE0 + unit);
-    gl.deleteTexture(this.textures[name].made ?? null);
-    gl.bindTexture(gl.TEXTURE_2D, (this.textures[name].made = gl.createTexture()));
-    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-    const padded = new data.constructor(WIDTH * rows * channels);
-    padded.set(data);
-    gl.texImage2D(gl.TEXTURE_2D, 0, internal, WIDTH, rows, 0, format, type, padded);
-    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
-    gl.useProgram(program);
-    gl.uniform1i(this.at(name, program), unit);
+  finish() {
+    this.gl.disable(this.gl.SCISSOR_TEST);
+    this.gl.bindFramebuffer(this.gl.FRAMEBUFFER, null);
   }
+  at(name, program) { return placeOf(this.gl, program, name); }
+  ints(program, values) { for (const name in values) this.gl.uniform1i(this.at(name, program), values[name]); }
   // A light with its lamps: disks; one that is smaller than a texel keeps its flux.
   radiance(message) {
     const edge = this.content.mips[0], light = Float32Array.from(this.lights[message.light]), { area } = grid(edge), fine = grid(edge * FINE);
@@ -133,9 +154,9 @@ class Piece {
     }
     return light;
   }
-  // The light side: the light blurred, and its harmonics as it is turned.
+  // The light side: the light blurred, and what arrives of it at vertices as it is turned.
   shine(message) {
-    const { gl, content } = this, key = JSON.stringify([message.light, message.lamps]);
+    const { gl, content, programs } = this, key = JSON.stringify([message.light, message.lamps]);
     if (this.lit !== key) {
       this.mips = new Map();
       const all = this.radiance(message);
@@ -154,17 +175,34 @@ class Piece {
       [this.lit, this.turned] = [key, ""];
     }
     if (this.turned === `${key} ${message.turn}`) return;
+    this.turned = `${key} ${message.turn}`;
     const c = Math.cos(message.turn), s = Math.sin(message.turn);
+    for (const program of [programs.vertex, programs.pixel, programs.sight]) {
+      gl.useProgram(program);
+      gl.uniform2f(this.at("turn", program), c, s);
+    }
+    if (!content.visibility) return;
     const edge = content.mips.find((each) => each <= 32) ?? content.mips.at(-1), rest = this.project(this.mips.get(edge), edge, c, s);
     const all = this.all ? this.project(this.all, edge, c, s) : rest;
-    [this.irradiance, this.irradianceOfAll] = [rest, all].map((each) => {
+    const [irradiance, irradianceOfAll] = [rest, all].map((each) => {
       const result = new Float32Array(3 * content.terms);
       content.vectorUnit.forEach((unit, k) => { for (let j = 0; j < 3; j++) result[3 * k + j] = unit * each[3 * k + j]; });
       return result;
     });
-    gl.uniform2f(this.at("turn"), c, s);
-    if (content.arrived) this.arrive(all);
-    this.turned = `${key} ${message.turn}`;
+    this.use(programs.arrive, this.arriving);
+    for (const part of content.parts) {
+      gl.uniform3fv(this.at("irradiance", programs.arrive), part.texels ? irradiance : irradianceOfAll);
+      this.ints(programs.arrive, { first: part.first, count: part.count, terms: part.terms });
+      this.over(part.first, part.count);
+    }
+    this.use(programs.sight, this.sight);
+    for (const part of content.parts) {
+      if (!part.texels) continue;
+      this.ints(programs.sight, { first: part.first, count: part.count, texels: this.texels, bitStart: part.bitStart });
+      this.over(part.first * this.sights, part.count * this.sights);
+    }
+    this.arrive(all);
+    this.finish();
   }
   // Harmonics of a light that is turned.
   project(light, edge, c, s) {
@@ -178,27 +216,28 @@ class Piece {
   }
   // Takes a light through the transfer matrices: what arrives is kept until the light changes.
   arrive(light) {
-    const { gl, content } = this;
+    const { gl, content, programs } = this;
     let key = "";
-    this.use(this.gather, this.arrived);
+    this.use(programs.gather, this.arrived);
     for (const part of content.parts) {
       if (!part.bands) continue;
       const own = `${part.bands} ${part.laplacian}`;
-      if (own !== key) this.texture("gathered", gl.RGBA32F, gl.RGBA, gl.FLOAT, gathered(light, part, content.visibleUnit), 4, this.gather);
+      if (own !== key) this.texture("gathered", gl.RGBA32F, gl.RGBA, gl.FLOAT, gathered(light, part, content.visibleUnit), 4);
       key = own;
-      for (const name of ["count", "bands", "words", "visibleStart", "arrivedStart"]) gl.uniform1i(this.at(name, this.gather), part[name]);
-      gl.drawArrays(gl.TRIANGLES, 0, 3);
+      for (const name of ["count", "bands", "words", "visibleStart", "arrivedStart"]) gl.uniform1i(this.at(name, programs.gather), part[name]);
+      this.over(part.arrivedStart, part.count * Math.ceil(part.bands ** 2 / 2));
     }
-    this.use(this.program, this.color);
   }
   // Takes the brightest texels out of a light, as far as they stand out: `jaxprt.bright_texels.split`.
   split(light) {
     const { gl, content } = this, edge = content.mips[0], { way, area } = grid(edge), count = content.texels;
+    this.texels = 0; // those that stand out
     if (!count) return light;
     const flux = area.map((each, i) => each * (light[3 * i] + light[3 * i + 1] + light[3 * i + 2]));
     const order = Array.from(flux.keys()).sort((a, b) => flux[b] - flux[a]), rest = light.slice(), data = new Float32Array(8 * count);
     for (let n = 0; n < count; n++) {
       const i = order[n], share = flux[i] > 0 ? Math.max(1 - flux[order[count]] / flux[i], 0) : 0;
+      if (share > 0) this.texels = n + 1;
       for (let c = 0; c < 3; c++) {
         data[8 * n + c] = way[3 * i + c];
         data[8 * n + 4 + c] = share * light[3 * i + c] * area[i] * (1 - area[i] / (4 * Math.PI)); // as a disk of its solid angle has
@@ -208,39 +247,45 @@ class Piece {
     this.texture("bright", gl.RGBA32F, gl.RGBA, gl.FLOAT, data, 4);
     return rest;
   }
-  look(message) {
+  // Draws each part by a program that shades. `over` draws one part's share of the target.
+  shade(program, message, over) {
     const { gl, content } = this;
-    if (gl.isContextLost()) { this.canvas = document.createElement("canvas"); this.build(); return this.look(message); }
-    const began = performance.now();
-    this.shine(message);
-    const lit = performance.now();
-    gl.uniform3fv(this.at("eye"), message.eye);
+    gl.uniform3fv(this.at("eye", program), message.eye);
     for (const part of content.parts) {
       const { weightStep, log } = this.material(part, message.materials[part.name]);
-      for (const name of ["first", "count", "lobes", "channels", "nodes", "tableStart", "weightStart", "pyramidStart", "terms", "bands", "entries", "arrivedStart", "bitStart"]) gl.uniform1i(this.at(name), part[name]);
-      gl.uniform1f(this.at("steps"), part.steps);
-      gl.uniform1i(this.at("texels"), part.texels ? content.texels : 0);
-      gl.uniform3fv(this.at("irradiance"), part.texels ? this.irradiance : this.irradianceOfAll);
-      gl.uniform1i(this.at("weightStep"), weightStep);
-      gl.uniform1f(this.at("logRoughness"), log);
-      gl.uniform1i(this.at("families"), part.family.terms.length);
+      for (const name of ["first", "count", "lobes", "channels", "nodes", "tableStart", "weightStart", "pyramidStart", "bands", "entries", "arrivedStart"]) gl.uniform1i(this.at(name, program), part[name]);
+      gl.uniform1f(this.at("steps", program), part.steps);
+      gl.uniform1f(this.at("logRoughness", program), log);
+      this.ints(program, { texels: part.texels ? this.texels : 0, weightStep, families: part.family.terms.length, knots: Math.max(part.knot.length, 1) });
       if (part.family.terms.length) {
-        gl.uniform1iv(this.at("term"), part.family.terms);
-        gl.uniform1fv(this.at("scale"), part.family.scale);
+        gl.uniform1iv(this.at("term", program), part.family.terms);
+        gl.uniform1fv(this.at("scale", program), part.family.scale);
       }
-      gl.uniform1i(this.at("knots"), Math.max(part.knot.length, 1));
-      if (part.knot.length) gl.uniform1fv(this.at("knot"), part.knot);
-      gl.drawArrays(gl.TRIANGLES, 0, 3);
+      if (part.knot.length) gl.uniform1fv(this.at("knot", program), part.knot);
+      over(part);
     }
-    const count = content.scene.vertices, found = new Uint32Array(4 * WIDTH * this.color.rows), result = new Uint16Array(3 * count);
+  }
+  // Radiance of the vertices into the texture of colors.
+  vertices(message) {
+    if (message === this.colored) return;
+    this.colored = message;
+    this.shine(message);
+    this.use(this.programs.vertex, this.color);
+    this.shade(this.programs.vertex, message, (part) => this.over(part.first, part.count));
+    this.finish();
+  }
+  // The colors that `vertices` has made, in half floats.
+  read() {
+    const { gl, count } = this, found = new Uint32Array(4 * WIDTH * this.color.rows), result = new Uint16Array(3 * count);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.color.frame);
     gl.readPixels(0, 0, WIDTH, this.color.rows, gl.RGBA_INTEGER, gl.UNSIGNED_INT, found);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     for (let i = 0; i < count; i++) {
       result[3 * i] = found[4 * i] & 65535;
       result[3 * i + 1] = found[4 * i] >>> 16;
       result[3 * i + 2] = found[4 * i + 1] & 65535;
     }
-    const ms = { light: lit - began, view: 0, combine: performance.now() - lit };
-    return { content: { kind: "color", seq: message.seq, scale: 1, ms }, buffers: [new DataView(result.buffer)] };
+    return result;
   }
   // Weights of a part whose material is one for all vertices, as `MetallicRoughness.coefficient` has them.
   material(part, change) {
@@ -284,11 +329,39 @@ class Piece {
     });
     part.written = key;
   }
+}
+function placeOf(gl, program, name) {
+  const known = (program.places ??= new Map());
+  if (!known.has(name)) known.set(name, gl.getUniformLocation(program, name));
+  return known.get(name);
+}
+
+// Answers the questions of `viewer.js` in an exported page, in place of Python.
+class Answers {
+  constructor(content, buffers) {
+    this.piece = new Piece(content, buffers);
+    this.names = [...content.scene.lights];
+    this.skies = content.skies.map((sky, i) => sky && { content: sky, buffers: [buffers[buffers.length - content.skies.slice(i).filter(Boolean).length]] });
+  }
+  // Colors of the vertices, for who has no picture.
+  look(message) {
+    const began = performance.now(), { piece } = this;
+    if (!piece.gl || piece.gl.isContextLost()) {
+      const gl = document.createElement("canvas").getContext("webgl2");
+      if (!gl) throw new Error("this browser has no WebGL2, which the viewer needs");
+      piece.build(gl);
+    }
+    piece.shine(message);
+    const lit = performance.now();
+    piece.vertices(message);
+    const result = piece.read(), ms = { light: lit - began, view: 0, combine: performance.now() - lit };
+    return { content: { kind: "color", seq: message.seq, scale: 1, ms }, buffers: [new DataView(result.buffer)] };
+  }
   sky(message) {
     const fine = this.skies[message.light];
     if (message.rows > 1 && fine && !message.lamps.length) return { ...fine, content: { ...fine.content, seq: message.seq } };
-    const edge = this.content.mips[0], light = this.radiance(message), height = 128, width = 256, result = new Uint16Array(3 * width * height);
-    const rim = new Float32Array(24 * (edge + 2) ** 2), index = this.index.get(edge), m = edge + 2;
+    const edge = this.piece.content.mips[0], light = this.piece.radiance(message), height = 128, width = 256, result = new Uint16Array(3 * width * height);
+    const rim = new Float32Array(24 * (edge + 2) ** 2), index = this.piece.index.get(edge), m = edge + 2;
     rimmed(light, edge, index, rim, 0);
     for (let y = 0; y < height; y++) for (let x = 0; x < width; x++) {
       const latitude = Math.PI * (0.5 - (y + 0.5) / height), longitude = Math.PI * (1 - (2 * (x + 0.5)) / width), ring = Math.cos(latitude);
@@ -305,33 +378,30 @@ class Piece {
     return { content: { kind: "sky", seq: message.seq, scale: 1, width, height }, buffers: [new DataView(result.buffer)] };
   }
   drop(message, data) {
-    const image = readHdr(new Uint8Array(data));
-    this.lights.push(toCubemap(image, this.content.mips[0]));
-    this.skies[this.lights.length - 1] = toSky(image);
+    const image = readHdr(new Uint8Array(data)), light = toCubemap(image, this.piece.content.mips[0]), { lights } = this.piece;
+    lights.push(light);
+    this.skies[lights.length - 1] = toSky(image);
     this.names.push(message.name.replace(/\.[^.]*$/, ""));
-    return { content: { kind: "lights", lights: [...this.names], light: this.names.length - 1 }, buffers: [] };
+    return { content: { kind: "lights", lights: [...this.names], light: this.names.length - 1 }, buffers: [new DataView(light.buffer)] };
   }
   answer(message, buffers) {
+    const { content, buffers: all } = this.piece;
     switch (message.kind) {
-      case "scene": return { content: { ...this.content.scene, lights: this.names }, buffers: [this.position, this.face] };
+      case "scene": return { content: { ...content.scene, lights: this.names }, buffers: all.slice(0, 2) };
+      case "page": return { content: { ...content, kind: "page", system: Object.keys(content.scene.systems)[0] }, buffers: all.slice(2) };
       case "look": return this.look(message);
       case "sky": return this.sky(message);
       default: return this.drop(message, buffers[0]);
     }
   }
 }
-function placeOf(gl, program, name) {
-  const known = (program.places ??= new Map());
-  if (!known.has(name)) known.set(name, gl.getUniformLocation(program, name));
-  return known.get(name);
-}
 
 // What `mount` of `viewer.js` asks: the answers of a scene that `export` has written.
 export function answers(content, buffers) {
-  const piece = new Piece(content, buffers);
+  const made = new Answers(content, buffers);
   return async (message, given = []) => {
     try {
-      return piece.answer(message, given);
+      return made.answer(message, given);
     } catch (error) {
       return { content: { kind: "error", of: message.kind, message: `${message.name ?? "the viewer"} ${error.message}` }, buffers: [] };
     }

@@ -4,6 +4,8 @@
 import { add, clamp, inflate, unit } from "./common.js";
 import { Camera, meet } from "./camera.js";
 import { Drawing } from "./drawing.js";
+import { Piece } from "./piece.js";
+import { Pixels } from "./pixels.js";
 import { panelOf } from "./panel.js";
 import { gestures } from "./gestures.js";
 import { frameOf } from "./frame.js";
@@ -37,14 +39,17 @@ export function mount(root, ask) {
       moved();
     }
   };
-  const redraw = () => { if (!wanted && !closed) wanted = requestAnimationFrame(draw); };
+  let fresh = false; // whether more has changed than what pixels show
+  const again = () => { if (!wanted && !closed) wanted = requestAnimationFrame(draw); };
+  const redraw = () => { fresh = true; again(); };
   const draw = (now) => {
     wanted = 0;
     if (!camera || closed || drawing.gl.isContextLost()) return;
-    const appears = drawing.draw(camera, state, scene.center, now);
+    const appears = drawing.draw(camera, state, scene.center, now, state.still && scene.rests.length > 0, fresh);
+    fresh = false;
     controls?.look(camera.azimuth);
     stats.draws++;
-    if (appears) redraw();
+    if (appears) again();
   };
   const message = (kind) => ({
     kind, viewer, seq, system: state.system, light: state.light, turn: state.turn, lamps: state.lamps, eye: camera.eye,
@@ -61,7 +66,43 @@ export function mount(root, ask) {
     redraw();
     look();
   };
+  // The GPU's scene: what it holds of a system, asked for once. Other states have their colors from Python.
+  let gpu = null, asked = "", lacking = "";
+  const page = async (from = scene) => {
+    const system = state.system;
+    if (asked === system) return;
+    asked = system;
+    try {
+      const { content, buffers } = await ask({ kind: "page", viewer, system });
+      if (closed || asked !== system) return;
+      gpu?.close();
+      gpu = null;
+      lacking = content.missing ?? content.message ?? "";
+      if (content.kind === "page" && !lacking) gpu = new Pixels(drawing.gl, new Piece(content, [...from.buffers, ...buffers]), 3 * (from.backs ?? from.face.length / 3));
+    } catch (error) { lacking = error.message; }
+    canvas.pixels = () => gpu;
+    if (gpu && scene) moved();
+  };
+  const shades = () => gpu !== null && asked === state.system && !state.bounces;
+  const shade = () => {
+    stats.sent++;
+    gpu.change(message("look"));
+    if (state.auto && exposed !== state.light) {
+      exposed = state.light;
+      find();
+    }
+    Object.assign(stats, { got: stats.got + 1, shown: seq, trip: 0 });
+    tell("");
+    const size = gpu.stats.level ? `pixels of ${gpu.stats.level}` : "vertices";
+    line.textContent = `${size} by the browser's GPU, ${gpu.stats.ms.toFixed(0)} ms · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}`;
+    redraw();
+    sky();
+    stillTimer = setTimeout(rested, 250);
+  };
   const look = async (vertices = "seen") => {
+    page();
+    drawing.gpu = shades() ? gpu : null;
+    if (drawing.gpu) return shade();
     if (flying) { dirty = true; return; }
     if (closed) return;
     [flying, dirty] = [true, false];
@@ -109,7 +150,7 @@ export function mount(root, ask) {
   const status = (ms, rate, bytes) => {
     const number = (x) => x.toFixed(x < 10 ? 1 : 0);
     line.textContent = `light ${number(ms.light)} ms · view ${number(ms.view)} ms · combine ${number(ms.combine)} ms · ` +
-      `there and back ${number(stats.trip)} ms · ${rate ? number(rate) + "/s · " : ""}${(bytes / 1024).toFixed(0)} kB · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}`;
+      `there and back ${number(stats.trip)} ms · ${rate ? number(rate) + "/s · " : ""}${(bytes / 1024).toFixed(0)} kB · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}${lacking ? ` · colors from Python: ${lacking}` : ""}`;
   };
   // The light as it is seen: a small picture at once and a fine one at rest, unless the way is long.
   const sky = async (rows = 1) => {
@@ -188,9 +229,10 @@ export function mount(root, ask) {
   const drop = async (file) => {
     if (file.size > 2 ** 29) return tell(`${file.name} must have at most 512 MiB, and has ${Math.ceil(file.size / 2 ** 20)}`);
     try {
-      const { content } = await ask({ kind: "drop", name: file.name }, [await file.arrayBuffer()]);
+      const { content, buffers } = await ask({ kind: "drop", name: file.name }, [await file.arrayBuffer()]);
       if (content.kind === "error") { stats.errors++; return tell(content.message); }
       scene.lights = content.lights;
+      if (gpu && buffers.length) gpu.piece.lights[content.light] = new Float32Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 4);
       set({ light: content.light, lamps: [] });
     } catch (error) { stats.errors++; tell(`no answer from Python: ${error.message}`); }
   };
@@ -235,9 +277,11 @@ export function mount(root, ask) {
       if (closed) return;
       if (content.kind === "error") return tell(content.message);
       const array = (buffer, kind) => new kind(buffer.buffer, buffer.byteOffset, buffer.byteLength / 4);
-      scene = { ...content, position: array(buffers[0], Float32Array), face: array(buffers[1], Uint32Array) };
+      const loaded = { ...content, buffers, position: array(buffers[0], Float32Array), face: array(buffers[1], Uint32Array) };
+      state.system ||= Object.keys(loaded.systems)[0];
+      if (!loaded.rests.length) await page(loaded); // of an exported scene
+      scene = loaded;
       camera ??= new Camera(scene);
-      state.system ||= Object.keys(scene.systems)[0];
       state.bounces = scene.systems[state.system].bounces;
       drawing.setMesh(scene.position, scene.face, scene.backs);
       controls = panelOf(panel, scene, state, { set, expose, automatic, map, moved, open: drop });

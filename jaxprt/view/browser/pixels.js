@@ -1,0 +1,278 @@
+// Shades the pixels of a picture on the GPU: first which triangle each pixel shows, then its light, part by part.
+
+import { clamp } from "./common.js";
+import { WHOLE, WIDTH } from "./shading.js";
+
+const RASTER = `#version 300 es
+precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
+uniform usampler2D faces; uniform sampler2D place; uniform mat4 matrix; flat out uvec3 triangle; out vec2 part;
+ivec2 at(int i) { return ivec2(i & ${WIDTH - 1}, i >> 12); }
+void main() {
+  int corner = gl_VertexID % 3;
+  triangle = texelFetch(faces, at(gl_VertexID / 3), 0).rgb;
+  part = vec2(corner == 0, corner == 1);
+  gl_Position = matrix * vec4(texelFetch(place, at(2 * int(triangle[corner])), 0).xyz, 1);
+}`;
+const TRIANGLE = `#version 300 es
+precision highp float; precision highp int; flat in uvec3 triangle; in vec2 part; out uvec4 o;
+void main() { o = gl_FrontFacing ? uvec4(triangle, packUnorm2x16(part)) : uvec4(0xfffffffeu, 0u, 0u, 0u); }`;
+const BARE = `#version 300 es
+precision highp float; precision highp int; precision highp usampler2D; uniform usampler2D shown; out vec4 o;
+void main() { // pixels without light: backs are black, and the others show the sky
+  uint vertex = texelFetch(shown, ivec2(gl_FragCoord.xy), 0).r;
+  if (vertex < 0xfffffffeu) discard;
+  o = vec4(0, 0, 0, vertex == 0xfffffffeu);
+}`;
+const EMPTY = Uint32Array.of(0xffffffff, 0, 0, 0);
+
+const PIXEL_EDGES = [0, 4, 2, 1]; // while something moves: colors at vertices, or edges of pixels
+const SLUGGISH = 45, BRISK = 22; // milliseconds of a frame from which on there are fewer pixels, and up to which more are tried
+const PAUSE = 150; // milliseconds without a change until a picture at rest begins
+const PATIENCE = 3000; // milliseconds of a first picture at rest after which it is left to Python, where there is one
+// Where in a pixel samples lie, from its middle: the middle itself, and then eight on as many rows and columns.
+const JITTER = [[0, 0], [1, -3], [-1, 3], [5, 1], [-3, -5], [-5, 5], [-7, -1], [3, 7], [7, -7]].map((each) => each.map((x) => x / 16));
+
+export class Pixels {
+  constructor(gl, piece, backs) { // of faces after the first `backs` no backs are seen
+    Object.assign(this, { gl, piece, backs });
+    this.level = 1; // of PIXEL_EDGES
+    this.trial = PIXEL_EDGES.map(() => ({ after: 0, pause: 2000 })); // when a finer level may be tried again
+    this.quick = 0; // quick frames one after another
+    this.strip = 1 << 14; // pixels at rest that are shaded in one call
+    this.stats = { level: 1, samples: 0, ms: 0 };
+    this.build();
+  }
+  build() {
+    const { gl, piece } = this;
+    piece.build(gl);
+    this.raster = piece.link(RASTER, TRIANGLE);
+    this.rest = piece.link(WHOLE, BARE);
+    this.unit = piece.unit++;
+    for (const program of [this.rest, piece.programs.pixel]) {
+      gl.useProgram(program);
+      gl.uniform1i(piece.at("shown", program), this.unit);
+    }
+    this.floats = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
+    this.images = {};
+    this.triangles = null;
+    this.fence = null;
+    this.shown = null; // the image that is seen; none while colors at vertices are
+    this.stale = Boolean(this.message);
+    this.boxes = piece.content.parts.map(({ first, count }) => {
+      const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+      for (let i = 3 * first; i < 3 * (first + count); i++) {
+        low[i % 3] = Math.min(low[i % 3], piece.position[i]);
+        high[i % 3] = Math.max(high[i % 3], piece.position[i]);
+      }
+      return [0, 1, 2, 3, 4, 5, 6, 7].map((k) => [0, 1, 2].map((axis) => ((k >> axis) & 1 ? high : low)[axis]));
+    });
+  }
+  close() {
+    const { gl, piece } = this;
+    for (const { made, frame } of Object.values(this.images)) { gl.deleteTexture(made); gl.deleteFramebuffer(frame); }
+    this.release();
+    gl.deleteProgram(this.raster);
+    gl.deleteProgram(this.rest);
+    if (this.fence) gl.deleteSync(this.fence.sync);
+    piece.close();
+  }
+  release() {
+    const { gl, triangles } = this;
+    if (!triangles) return;
+    gl.deleteTexture(triangles.made);
+    gl.deleteRenderbuffer(triangles.depth);
+    gl.deleteFramebuffer(triangles.frame);
+    this.triangles = null;
+  }
+  // The picture has changed: its light, view, materials or size.
+  change(message) {
+    this.message = message;
+    this.stale = true;
+  }
+  // Whether the GPU is still at what it was given.
+  get busy() {
+    const { gl, fence } = this;
+    if (!fence) return false;
+    if (gl.getSyncParameter(fence.sync, gl.SYNC_STATUS) !== gl.SIGNALED) return true;
+    gl.deleteSync(fence.sync);
+    this.fence = null;
+    this.learn(performance.now() - fence.since, fence.moving);
+    return false;
+  }
+  sent(moving) {
+    const { gl } = this;
+    this.fence = { sync: gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0), since: performance.now(), moving };
+    gl.flush();
+  }
+  learn(ms, moving) {
+    if (!moving) { this.strip = clamp(ms < BRISK ? 2 * this.strip : ms > 2 * SLUGGISH ? this.strip / 2 : this.strip, 4096, 1 << 22); return; }
+    this.stats.ms = ms;
+    const now = performance.now(), finer = this.trial[this.level + 1];
+    this.quick = ms < BRISK ? this.quick + 1 : 0;
+    if (ms > SLUGGISH && this.level > this.least) {
+      const { pause } = this.trial[this.level];
+      this.trial[this.level] = { after: now + pause, pause: Math.min(2 * pause, 60000) };
+      this.level--;
+    } else if (finer && this.floats && this.quick > 2 && now > finer.after) {
+      this.level++;
+      this.quick = 0;
+    }
+  }
+  // Gives the GPU the work of a frame. True if there is more to do.
+  work(now, matrix, width, height, python) {
+    this.fresh = false; // whether more is seen after it
+    this.least = this.floats && this.piece.count > (width * height) / 4 ? 1 : 0; // pixels may be fewer than vertices
+    this.level = this.floats ? Math.max(this.level, this.least) : 0;
+    if (this.stale) {
+      this.stale = false;
+      this.since = now + PAUSE;
+      [this.sample, this.row] = [0, 0];
+      this.stats.samples = 0;
+      this.move(matrix, width, height);
+      return true;
+    }
+    if (!this.message || !this.floats || this.sample >= JITTER.length) return false;
+    if (now < this.since) return true;
+    if (python && !this.sample && now - this.since > PATIENCE) return false;
+    this.refine(matrix, width, height);
+    return this.sample < JITTER.length;
+  }
+  move(matrix, width, height) {
+    const step = PIXEL_EDGES[this.level];
+    this.fresh = true;
+    this.stats.level = step;
+    if (step) {
+      const size = [width, height].map((x) => Math.ceil(x / step));
+      this.piece.shine(this.message);
+      this.find(matrix, ...size, width, height);
+      this.shown = this.image(`step ${step}`, ...size);
+      this.shade(this.shown, matrix, 0, size[1], 1);
+    } else {
+      this.piece.vertices(this.message);
+      this.shown = null;
+    }
+    this.sent(true);
+  }
+  // One strip of the picture at rest; each sample counts as much as those before.
+  refine(matrix, width, height) {
+    this.piece.shine(this.message);
+    const jitter = JITTER[this.sample], moved = Float32Array.from(matrix);
+    for (let j = 0; j < 4; j++) for (let c = 0; c < 2; c++) moved[4 * j + c] += ((2 * jitter[c]) / [width, height][c]) * matrix[4 * j + 3];
+    if (!this.row) this.find(moved, width, height, width, height);
+    const image = this.image("rest", width, height), rows = clamp(Math.floor(this.strip / width), 1, height - this.row);
+    this.shade(image, moved, this.row, rows, 1 / (this.sample + 1));
+    this.row += rows;
+    this.fresh = this.row >= height;
+    if (this.row >= height) {
+      this.row = 0;
+      this.stats.samples = ++this.sample;
+      this.shown = image;
+    }
+    this.sent(false);
+  }
+  image(name, width, height) {
+    const gl = this.gl, held = this.images[name];
+    if (held?.width === width && held.height === height) return held;
+    if (held) { gl.deleteTexture(held.made); gl.deleteFramebuffer(held.frame); }
+    const made = gl.createTexture(), frame = gl.createFramebuffer();
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, made);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, width, height);
+    for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.LINEAR);
+    for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, made, 0);
+    return (this.images[name] = { made, frame, width, height });
+  }
+  // The vertices of the triangle that each pixel shows, and where the pixel lies between them.
+  find(matrix, columns, rows, width, height) {
+    const { gl, piece } = this;
+    if (this.triangles?.width !== width || this.triangles.height !== height) {
+      this.release();
+      const made = gl.createTexture(), frame = gl.createFramebuffer(), depth = gl.createRenderbuffer();
+      gl.activeTexture(gl.TEXTURE0 + this.unit);
+      gl.bindTexture(gl.TEXTURE_2D, made);
+      gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, width, height);
+      for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
+      gl.bindRenderbuffer(gl.RENDERBUFFER, depth);
+      gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, height);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, made, 0);
+      gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, depth);
+      this.triangles = { made, frame, depth, width, height };
+    }
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.triangles.frame);
+    gl.viewport(0, 0, columns, rows);
+    gl.clearBufferuiv(gl.COLOR, 0, EMPTY);
+    gl.clear(gl.DEPTH_BUFFER_BIT);
+    gl.useProgram(this.raster);
+    gl.bindVertexArray(piece.empty);
+    gl.uniformMatrix4fv(piece.at("matrix", this.raster), false, matrix);
+    drawSides(gl, this.backs, piece.face.length, (vertices) => gl.drawArrays(gl.TRIANGLES, 0, vertices));
+  }
+  // Shades rows of an image; `weight` is what the new colors count beside the old ones.
+  shade(image, matrix, row, rows, weight) {
+    const { gl, piece } = this, { width, height } = image;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, image.frame);
+    gl.viewport(0, 0, width, height);
+    gl.bindVertexArray(piece.empty);
+    gl.enable(gl.SCISSOR_TEST);
+    gl.scissor(0, row, width, rows);
+    if (weight < 1) {
+      gl.enable(gl.BLEND);
+      gl.blendColor(0, 0, 0, weight);
+      gl.blendFunc(gl.CONSTANT_ALPHA, gl.ONE_MINUS_CONSTANT_ALPHA);
+    }
+    gl.useProgram(this.rest);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.useProgram(piece.programs.pixel);
+    piece.shade(piece.programs.pixel, this.message, (part) => {
+      const [left, low, right, high] = bounds(this.boxes[piece.content.parts.indexOf(part)], matrix, width, height);
+      const [from, to] = [Math.max(low, row), Math.min(high, row + rows)];
+      if (left >= right || from >= to) return;
+      gl.scissor(left, from, right - left, to - from);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    });
+    gl.disable(gl.BLEND);
+    piece.finish();
+  }
+  // Colors and coverage of the picture at rest, from its lowest row.
+  read() {
+    const { gl } = this, { frame, width, height } = this.images.rest, data = new Float32Array(4 * width * height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, data);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    return { data, width, height };
+  }
+}
+
+// Draws faces with what is seen of their backs. Backs lie a little deeper: at silhouettes they are as deep as the fronts
+// beside them, and would show as dots.
+export function drawSides(gl, backs, count, draw) {
+  gl.enable(gl.DEPTH_TEST);
+  gl.enable(gl.CULL_FACE);
+  gl.enable(gl.POLYGON_OFFSET_FILL);
+  gl.polygonOffset(2, 4);
+  gl.cullFace(gl.FRONT);
+  draw(backs);
+  gl.disable(gl.POLYGON_OFFSET_FILL);
+  gl.cullFace(gl.BACK);
+  draw(count);
+  gl.disable(gl.CULL_FACE);
+  gl.disable(gl.DEPTH_TEST);
+}
+
+// The rectangle of pixels in which a box is seen: left, low, right, high.
+function bounds(box, matrix, width, height) {
+  const result = [Infinity, Infinity, -Infinity, -Infinity];
+  for (const corner of box) {
+    const [x, y, , w] = [0, 1, 2, 3].map((k) => matrix[k] * corner[0] + matrix[4 + k] * corner[1] + matrix[8 + k] * corner[2] + matrix[12 + k]);
+    if (w <= 0) return [0, 0, width, height];
+    [x, y].forEach((each, c) => {
+      const place = (each / w + 1) / 2 * [width, height][c];
+      result[c] = Math.min(result[c], place);
+      result[2 + c] = Math.max(result[2 + c], place);
+    });
+  }
+  return result.map((x, i) => clamp(i < 2 ? Math.floor(x) - 1 : Math.ceil(x) + 1, 0, i % 2 ? height : width));
+}
