@@ -141,9 +141,8 @@ function stripOf(canvas, tint, state, set) {
     const context = canvas.getContext("2d"), w = width(), left = (((-state.turn / (2 * Math.PI)) % 1) + 1) % 1 * w;
     for (const x of [left - w, left]) context.drawImage(image, x, 0, w, canvas.height);
     const x = (((0.5 - (azimuth + Math.PI) / (2 * Math.PI)) % 1) + 1) % 1 * w, y = canvas.height;
-    const mark = (color, size) => { context.fillStyle = color; context.beginPath(); context.moveTo(x - size, y); context.lineTo(x + size, y); context.lineTo(x, y - 1.6 * size); context.fill(); };
-    mark("#000", 7);
-    mark("#fff", 5);
+    const mark = (at, color, size) => { context.fillStyle = color; context.beginPath(); context.moveTo(at - size, y); context.lineTo(at + size, y); context.lineTo(at, y - 1.6 * size); context.fill(); };
+    for (const at of [x - w, x, x + w]) for (const [color, size] of [["#000", 7], ["#fff", 5]]) mark(at, color, size);
     if (keys) {
       for (const [color, size] of [["#000", 3], ["#fff", 1]]) {
         context.strokeStyle = color;

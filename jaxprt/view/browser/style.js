@@ -30,8 +30,8 @@ button.main { background: var(--mark); border-color: var(--mark); color: var(--m
 .stagetext, .told { padding: 2px 8px; border-radius: 4px; background: var(--over); overflow-wrap: anywhere; }
 .stagetext { color: var(--dim); font-variant-numeric: tabular-nums; }
 .told { border-left: 3px solid var(--mark); }
-.line { position: absolute; left: 8px; right: 8px; bottom: 6px; color: #ddd; pointer-events: none; text-shadow: 0 0 3px #000, 0 0 3px #000; white-space: nowrap; overflow: hidden; text-overflow: ellipsis; }
-.hint { position: absolute; left: 50%; bottom: 32px; width: max-content; max-width: calc(100% - 16px); transform: translateX(-50%); padding: 4px 12px; border-radius: 14px; background: var(--over); text-align: center; pointer-events: none; }
+.line { position: absolute; left: 8px; right: 8px; bottom: 6px; color: #ddd; pointer-events: none; text-shadow: 0 0 3px #000, 0 0 3px #000; }
+.hint { position: absolute; left: 50%; bottom: 50px; width: max-content; max-width: calc(100% - 16px); transform: translateX(-50%); padding: 4px 12px; border-radius: 14px; background: var(--over); text-align: center; pointer-events: none; }
 kbd { font: inherit; font-weight: 600; padding: 0 4px; border: 1px solid var(--edge); border-radius: 3px; background: var(--field); white-space: nowrap; }
 .help { position: absolute; left: 8px; top: 8px; max-width: calc(100% - 16px); max-height: calc(100% - 16px); overflow: auto; padding: 8px 12px 12px; border: 1px solid var(--edge); border-radius: 8px; background: var(--card); }
 .help header { display: flex; justify-content: space-between; align-items: center; gap: 12px; font-weight: 600; }
@@ -67,6 +67,7 @@ dialog .row.end button { flex: 0 0 auto; padding: 2px 12px; }
 .frame.narrow { flex-direction: column; }
 .frame.narrow .panel { width: auto; max-height: 55%; border-left: 0; border-top: 1px solid var(--edge); }
 .frame.narrow .row { min-height: 32px; }
+.frame.narrow .sky { aspect-ratio: 3.2; }
 .frame.narrow .line { display: none; }
 .frame.narrow .hint { bottom: 10px; }
 .frame.narrow .words { top: 44px; max-width: calc(100% - 16px); }

@@ -1,0 +1,402 @@
+"""The viewer's interface: each state shows its controls within the page, and what is typed or clicked acts.
+
+`pytest --basetemp=FOLDER` keeps the screenshots.
+"""
+
+import io
+import json
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import jaxprt as prt
+from jaxprt import image, view
+from jaxprt.image.pixels import seen_from_front
+from jaxprt.scene import Camera, Part, Scene, TexturedMaterial, builtin
+from jaxprt.scene.environment import rotate
+from jaxprt.view import Server, Session, stages
+from tests.view.test_browser import CANVAS, Hand
+
+ROOT = "document.querySelector('#viewer').shadowRoot"
+EXPOSURE = 0.15  # stops: bytes, and the viewer's samples of a pixel
+# Controls that leave the page or the picture, texts that are cut off, and boxes over the picture that overlap.
+MISPLACED = f"""() => {{
+  const root = {ROOT}, bad = [], shown = (each) => each.checkVisibility({{ visibilityProperty: true }});
+  const texts = "button, select, input, summary, span, td, h2, .note, .told, .stagetext, .hint, .line";
+  for (const each of root.querySelectorAll(texts)) {{
+    const box = each.getBoundingClientRect();
+    if (!shown(each) || !box.width) continue;
+    const name = each.getAttribute("aria-label") ?? each.textContent ?? each.type;
+    if (box.left < -0.5 || box.right > innerWidth + 0.5) bad.push(`${{name}} leaves the page`);
+    if (each.clientWidth && each.scrollWidth > each.clientWidth + 1) bad.push(`${{name}} is cut off`);
+  }}
+  const boxes = [...root.querySelectorAll(".words > :not([hidden]), .tools, .hint, .line")];
+  const over = boxes.filter((each) => shown(each) && each.textContent + each.children.length !== "0");
+  for (const [i, one] of over.entries()) for (const other of over.slice(i + 1)) {{
+    const a = one.getBoundingClientRect(), b = other.getBoundingClientRect();
+    const wide = Math.min(a.right, b.right) - Math.max(a.left, b.left);
+    if (wide > 1 && Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > 1)
+      bad.push(`${{one.className}} lies over ${{other.className}}`);
+  }}
+  return bad;
+}}"""
+UNNAMED = f"""() => [...{ROOT}.querySelectorAll("button, select, input:not([hidden]), canvas")]
+  .filter((each) => !(each.getAttribute("aria-label") || each.labels?.[0]?.textContent || each.textContent))
+  .map((each) => each.outerHTML)"""
+FOCUSED = f"""() => {{
+  const each = {ROOT}.activeElement;
+  return each && (each.ariaLabel ?? each.labels?.[0]?.textContent ?? each.textContent);
+}}"""
+OPENED = f"""() => [...{ROOT}.querySelectorAll('details.part[open]')]
+  .map((part) => part.querySelector('summary').textContent)"""
+
+
+@pytest.fixture
+def server(session):
+    made = Server(session)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def hand(browser, server):
+    made = Hand(browser, server.url)
+    yield made
+    made.page.close()
+    assert not made.errors
+
+
+@pytest.fixture
+def shoot(tmp_path):
+    """Takes a screenshot of a state, in which nothing is misplaced."""
+
+    def shot(hand, name):
+        hand.page.screenshot(path=str(tmp_path / f"{name}.png"))
+        assert hand.page.evaluate(MISPLACED) == [], name
+
+    return shot
+
+
+def resized(hand, width, height):
+    hand.page.set_viewport_size({"width": width, "height": height})
+    hand.page.wait_for_timeout(300)
+    hand.settle()
+
+
+def typed(hand, label, text):
+    """Types into the number of a slider."""
+    field = hand.page.get_by_label(f"{label}, typed").filter(visible=True).first
+    field.fill(text)
+    field.press("Enter")
+    hand.settle()
+
+
+def test_each_state_shows_its_controls_within_the_page(hand, session, monkeypatch, shoot):
+    page = hand.page
+    resized(hand, 900, 560)
+    page.get_by_text("for all keys").wait_for()
+    shoot(hand, "start")
+    typed(hand, "roughness", "0.25")
+    hand.still()
+    shoot(hand, "typed")
+    assert page.locator("canvas.plane").is_visible()
+    assert hand.state()["materials"]["ball"]["roughness"] == 0.25
+    typed(hand, "rotation °", "90")
+    page.wait_for_timeout(300)
+    shoot(hand, "rotated")
+    page.get_by_role("button", name="help (H)").click()
+    assert page.get_by_role("dialog", name="help").is_visible()
+    shoot(hand, "help")
+    page.keyboard.press("Escape")
+    assert page.get_by_role("dialog", name="help").is_hidden()
+    page.get_by_role("button", name="dark or light").click()
+    shoot(hand, "other theme")
+    page.get_by_role("button", name="save a picture").click()
+    page.get_by_label("width in pixels").wait_for()
+    shoot(hand, "dialog")
+    page.get_by_role("button", name="cancel").click()
+    answer = session.answer
+
+    def refused(message, buffers=()):
+        message = message | {"turn": "east"} if message["kind"] == "look" else message
+        return answer(message, buffers)
+
+    monkeypatch.setattr(session, "answer", refused)
+    page.locator("canvas.canvas").focus()
+    page.keyboard.press("]")
+    page.get_by_text("turn must be a finite number, got 'east'").wait_for()
+    shoot(hand, "message")
+    page.set_viewport_size({"width": 390, "height": 700})
+    page.wait_for_timeout(300)
+    assert page.get_by_role("region", name="controls").is_hidden()
+    shoot(hand, "narrow with a message")
+    monkeypatch.setattr(session, "answer", answer)
+    page.keyboard.press("]")
+    hand.settle()
+    page.get_by_role("button", name="controls").click()
+    assert page.get_by_role("region", name="controls").is_visible()
+    shoot(hand, "narrow")
+
+
+def test_every_control_has_a_name_and_is_reached_by_keys(hand):
+    assert hand.page.evaluate(UNNAMED) == []
+    for each in hand.page.locator("summary").all():
+        each.scroll_into_view_if_needed()
+    hand.page.locator("canvas.canvas").focus()
+    reached = set()
+    for _ in range(60):
+        hand.page.keyboard.press("Tab")
+        reached.add(
+            hand.page.evaluate(
+                f"() => {{ const e = {ROOT}.activeElement; return e && (e.ariaLabel ?? e.labels?.[0]?.textContent ?? e.textContent); }}"
+            )
+        )
+    for name in (
+        "save a picture",
+        "reset the view, the light and the materials (R)",
+        "rotation °",
+        "rotation °, typed",
+    ):
+        assert name in reached
+    for name in ("background", "metallic, typed", "roughness across and F0 up; arrows move the point", "remove suns"):
+        assert name in reached or name == "remove suns"  # a button that cannot act is passed over
+    plane = hand.page.locator("canvas.plane")
+    plane.focus()
+    before = hand.state()["materials"]
+    hand.page.keyboard.press("ArrowRight")
+    hand.settle()
+    assert before == {}
+    assert hand.state()["materials"]["ball"]["roughness"] == pytest.approx(0.55)
+    hand.page.locator("canvas.sky").focus()
+    hand.page.keyboard.press("Enter")
+    hand.settle()
+    assert len(hand.state()["lamps"]) == 1
+
+
+def test_typed_numbers_change_the_scene_and_the_sliders(hand):
+    before = hand.pixels()
+    typed(hand, "rotation °", "90")
+    assert hand.state()["turn"] == pytest.approx(np.pi / 2)
+    assert np.abs(hand.pixels() - before).max() > 0.05
+    typed(hand, "rotation °", "270")  # once around
+    assert hand.state()["turn"] == pytest.approx(-np.pi / 2)
+    assert hand.page.get_by_label("rotation °", exact=True).input_value() == "-90"
+    typed(hand, "metallic", "7")  # as much as there is
+    assert hand.state()["materials"]["ball"]["metallic"] == 1
+    typed(hand, "metallic", "")
+    assert hand.state()["materials"]["ball"]["metallic"] == 1
+    assert hand.page.get_by_label("metallic, typed").input_value() == "1"
+    assert hand.page.locator("canvas.plane").is_hidden()  # of a metal the base color is the reflectance
+    typed(hand, "metallic", "0.5")
+    assert hand.page.locator("canvas.plane").is_visible()
+    typed(hand, "specular F0", "0.2")
+    assert hand.state()["materials"]["ball"] == {"metallic": 0.5, "f0": 0.2}
+    typed(hand, "exposure", "-2.5")
+    assert hand.state()["stops"] == -2.5
+    assert not hand.page.get_by_label("automatic exposure").is_checked()
+    hand.page.get_by_role("button", name="as it was").first.click()
+    hand.settle()
+    assert hand.state()["materials"] == {}
+
+
+def test_a_matte_part_has_a_base_color_alone(hand):
+    ground = hand.page.locator("details.part").nth(1)
+    assert ground.locator("summary").text_content() == "ground"
+    assert ground.locator("label, .row > span, canvas").all_text_contents() == ["base color", "base color"]
+
+
+def strip(hand):
+    """The strip of the light, in bytes."""
+    text = hand.page.evaluate(f"() => {ROOT}.querySelector('.sky').toDataURL('image/png')")
+    import base64
+
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(text.partition(",")[2]))).convert("RGB")).astype(float)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 90.0, -135.0])
+def test_a_sun_lands_where_the_mouse_is_in_the_turned_light(hand, degrees):
+    typed(hand, "rotation °", str(degrees))
+    hand.page.wait_for_timeout(500)
+    before = strip(hand)
+    box = hand.page.locator("canvas.sky").bounding_box()
+    u, v = 0.3, 0.4
+    painted = hand.stats()["sky"]
+    hand.page.mouse.click(box["x"] + u * box["width"], box["y"] + v * box["height"])
+    hand.settle()
+    (lamp,) = hand.state()["lamps"]
+    turned = np.asarray(stages.about(np.radians(degrees))) @ lamp["direction"]
+    lon, lat = np.pi * (1 - 2 * u), np.pi * (0.5 - v)
+    there = np.array([np.cos(lat) * np.sin(lon), np.sin(lat), np.cos(lat) * np.cos(lon)])
+    assert np.dot(turned, there) > np.cos(0.02)
+    assert painted
+    for _ in range(40):
+        brighter = (strip(hand) - before).mean(-1)
+        if brighter.max() > 10:
+            break
+        time.sleep(0.1)
+    row, column = np.unravel_index(np.argmax(brighter), brighter.shape)
+    height, width = brighter.shape
+    assert abs((column + 0.5) / width - u) < 0.05
+    assert abs((row + 0.5) / height - v) < 0.08
+
+
+def test_the_hint_goes_away_at_first_use_and_every_key_of_the_help_acts(hand):
+    page = hand.page
+    assert page.locator(".hint").is_visible()
+    page.locator("canvas.canvas").focus()
+    page.keyboard.press("g")
+    assert page.locator(".hint").is_hidden()
+    keys = page.evaluate(f"() => [...{ROOT}.querySelectorAll('.help kbd')].map((each) => each.textContent)")
+    names = {"←": "ArrowLeft", "→": "ArrowRight", "↑": "ArrowUp", "↓": "ArrowDown"}
+    acting = [names.get(key, key) for key in keys if key not in ("Shift", "Ctrl", "Alt")]
+    assert len(acting) > 20
+    ignored = page.evaluate(
+        f"""(keys) => keys.filter((key) => ({CANVAS}).dispatchEvent(
+            new KeyboardEvent("keydown", {{ key, bubbles: true, composed: true, cancelable: true }})))""",
+        acting,
+    )
+    assert ignored == []
+    page.get_by_label("exposure, typed").focus()  # where letters are typed, they do nothing else
+    state = hand.state()
+    page.keyboard.press("g")
+    assert hand.state()["background"] == state["background"]
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_it_starts_at_the_automatic_exposure_of_the_object(hand, systems, lights, number):
+    if number:
+        hand.page.locator("canvas.canvas").focus()
+        hand.page.keyboard.press("l")
+        hand.settle()
+    state, view_of = hand.state(), hand.camera()
+    scene = systems["lobes"]
+    height, width = 96, round(96 * hand.pixels().shape[1] / hand.pixels().shape[0])
+    camera = Camera(view_of["eye"], view_of["target"], [0.0, 1.0, 0.0], view_of["angle"], width, height)
+    light = list(lights.values())[number]
+    color = scene.radiance(light, eye=np.asarray(view_of["eye"]))
+    hidden = Session(systems, environments=lights)._hidden_faces()
+    picture = image.render(seen_from_front(scene.mesh, camera, hidden), color, camera)
+    expected = float(image.automatic_exposure(picture, coverage=scene.coverage(camera)))
+    assert state["light"] == number
+    assert state["stops"] == pytest.approx(expected, abs=EXPOSURE)
+
+
+def saved(hand, width, height, *, transparent):
+    """The pixels of a picture that the dialog saves, in [0, 1]."""
+    hand.page.get_by_role("button", name="save a picture").click()
+    hand.page.get_by_label("width in pixels").fill(str(width))
+    hand.page.get_by_label("height in pixels").fill(str(height))
+    hand.page.get_by_label("transparent background").set_checked(transparent)
+    with hand.page.expect_download(timeout=60_000) as download:
+        hand.page.get_by_role("button", name="save PNG").click()
+    assert download.value.suggested_filename == "jaxprt.png"
+    picture = np.asarray(Image.open(download.value.path())) / 255
+    hand.page.get_by_label("width in pixels").wait_for(state="hidden")
+    return picture
+
+
+def test_a_picture_of_any_size_is_saved_with_alpha(hand, systems, lights, session, monkeypatch):
+    typed(hand, "rotation °", "40")
+    state, camera = hand.state(), hand.camera()
+    eye = Camera(camera["eye"], camera["target"], [0.0, 1.0, 0.0], camera["angle"], 50, 30)
+    light = rotate(lights["lamp"], stages.about(state["turn"]))
+    expected = image.display(systems["lobes"].picture(light, eye, samples=16), stops=state["stops"])
+    np.testing.assert_allclose(saved(hand, 50, 30, transparent=False), expected, atol=0.6 / 255)
+    clear = saved(hand, 50, 30, transparent=True)
+    np.testing.assert_allclose(clear[..., 3], systems["lobes"].coverage(eye, samples=16), atol=0.6 / 255)
+    hand.page.get_by_role("button", name="save a picture").click()
+    for name in ("width", "height"):
+        hand.page.get_by_label(f"{name} in pixels").fill("8000")
+    hand.page.get_by_role("button", name="save PNG").click()
+    hand.page.get_by_text("a picture must have at most 16777216 pixels, got 8000 x 8000").wait_for()
+    hand.page.get_by_label("width in pixels").fill("50")
+    hand.page.get_by_label("height in pixels").fill("30")
+    picture = session.stages.picture
+
+    def slow(*arguments, **options):
+        time.sleep(1.5)
+        return picture(*arguments, **options)
+
+    monkeypatch.setattr(session.stages, "picture", slow)
+    hand.page.get_by_label("transparent background").set_checked(False)
+    bar = hand.page.get_by_role("progressbar", name="a picture of 50 x 30 pixels")
+    with hand.page.expect_download():
+        hand.page.get_by_role("button", name="save PNG").click()
+        bar.wait_for()
+        assert hand.page.locator(".stagetext").text_content() == "a picture of 50 x 30 pixels"
+    bar.wait_for(state="hidden")
+
+
+def test_an_exported_page_saves_pictures_by_its_graphics_card(browser, systems, lights, tmp_path):
+    piece = view.export(systems["harmonics"], tmp_path / "page.html", environments=lights)
+    hand = Hand(browser, piece.path.as_uri())
+    shown = hand.pixels()
+    height, width = shown.shape[:2]
+    picture = saved(hand, width, height, transparent=False)
+    assert picture.shape == (height, width, 4)
+    np.testing.assert_array_equal(picture[..., 3], 1)
+    off = np.abs(picture[..., :3] - shown)
+    assert off.mean() < 1 / 255
+    assert np.quantile(off, 0.99) < 0.1  # along edges
+    clear = saved(hand, width, height, transparent=True)
+    inside = clear[..., 3] == 1
+    assert 0.2 < inside.mean() < 0.9
+    np.testing.assert_allclose(clear[inside], picture[inside], atol=1.5 / 255)
+    assert np.all(clear[clear[..., 3] == 0] == 0)
+    assert not hand.errors
+    hand.page.close()
+
+
+def test_the_theme_follows_the_system_until_a_button_changes_it(browser, server):
+    tab = browser.new_context(viewport={"width": 584, "height": 320}, color_scheme="light").new_page()
+    ground = f"() => getComputedStyle({ROOT}.querySelector('.panel')).backgroundColor"
+
+    def brightness():
+        return np.mean(json.loads(tab.evaluate(ground).replace("rgb(", "[").replace(")", "]")))
+
+    tab.goto(server.url)
+    tab.get_by_role("button", name="dark or light").wait_for()
+    assert brightness() > 200
+    tab.get_by_role("button", name="dark or light").click()
+    assert brightness() < 60
+    tab.reload()
+    tab.get_by_role("button", name="dark or light").wait_for()
+    assert brightness() < 60
+    tab.context.close()
+
+
+def test_thirty_parts_are_folded_found_by_name_and_picked_in_the_picture(browser, lights, shoot):
+    ball, material = builtin.sphere(rings=6, sectors=12), TexturedMaterial((0.3, 0.3, 0.1), metallic=0.5, roughness=0.5)
+    parts = []
+    for k in range(30):
+        place = np.float32([k % 6 - 2.5, k // 6 - 2, 0])
+        mesh = prt.scene.mesh.make_mesh(0.4 * np.asarray(ball.position) + place, ball.face)
+        parts.append(Part(f"piece {k}", mesh, material))
+    scene = Scene(parts, cameras=[Camera([0.0, 0.0, 9.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 0.7, 64, 64)])
+    made = prt.precompute(scene, refine=False, system=prt.relit.Harmonics(2), size=8, progress=False)
+    server = Server(Session(made, environments=lights))
+    hand = Hand(browser, server.url)
+    resized(hand, 784, 520)
+    page = hand.page
+    opened = f"() => [...{ROOT}.querySelectorAll('details.part[open]')].map((part) => part.querySelector('summary').textContent)"
+    assert page.evaluate(opened) == []
+    shoot(hand, "thirty parts")
+    page.get_by_label("find a part").fill("piece 2")
+    assert page.locator("details.part").filter(visible=True).count() == 11  # 2, and 20 to 29
+    # The middle of the picture is that of the third row, between the third and the fourth ball.
+    height = 520 / (2 * 9 * np.tan(0.35))
+    page.keyboard.down("Alt")
+    page.mouse.click(260 + 0.5 * height, 260 - height)
+    page.keyboard.up("Alt")
+    assert page.evaluate(opened) == ["piece 21"]
+    shoot(hand, "picked")
+    typed(hand, "roughness", "0.9")
+    assert hand.state()["materials"] == {"piece 21": {"roughness": 0.9}}
+    page.mouse.dblclick(260 + 1.5 * height, 260)
+    hand.settle()
+    assert page.evaluate(opened) == ["piece 16", "piece 21"]
+    page.close()
+    assert not hand.errors
+    server.close()
