@@ -14,7 +14,7 @@ from jaxprt.cli.options import option
 from jaxprt.files import outputs
 from jaxprt.scene import Environment, light_probe
 from jaxprt.scene.light_probes import TOOLS
-from jaxprt.view import export, export_baked
+from jaxprt.view import export, export_baked, page_error
 
 _KINDS = {".html": "page", ".glb": "baked", ".json": "probes"}
 
@@ -53,6 +53,15 @@ _KINDS = {".html": "page", ".glb": "baked", ".json": "probes"}
     help="Largest size of the page in bytes.",
 )
 @option(
+    "--error",
+    group="Output",
+    type=options.Finite(0.0),
+    metavar="E",
+    default=page_error.NOTABLE,
+    show_default=True,
+    help="Largest relative L2 error of the page's pictures. A page with more is not written; the message says why.",
+)
+@option(
     "--tool",
     group="Output",
     type=options.Several(click.Choice(TOOLS, case_sensitive=False)),
@@ -70,7 +79,8 @@ def command(**arguments: Any) -> None:
     """Write a scene or its lights for other programs.
 
     \b
-    *.html  a page that relights the scene in any browser, without Python and offline
+    *.html  a page that relights the scene in any browser, without Python and offline; it is written if its pictures are
+          at most --error off those of the scene
     *.glb   the scene as glTF, with the radiance under the first light as vertex colors
     *.json  light probes: nine spherical harmonics of each light, in the scaling and axes of other tools
 
@@ -132,9 +142,11 @@ def _write(chosen: SimpleNamespace) -> list[dict[str, Any]]:
             scene = inputs.scene(chosen, playable=True)
             ready = play.precompute_scene(scene, lights, recipe, chosen.bounces, chosen.store)
         if kind == "page":
-            piece = export(ready, path, environments=lights, most=chosen.most)
-            row = {"error": piece.error, "visibility_edge": piece.edge, "degree": piece.degree}
-            words = f", {100 * piece.error:.1f} % off the whole scene"
+            piece = export(ready, path, environments=lights, most=chosen.most, error=chosen.error)
+            causes = {cause.name: cause.error for cause in piece.causes}
+            row = {"error": piece.error, "causes": causes, "visibility_edge": piece.edge, "degree": piece.degree}
+            words = f", {100 * piece.error:.1f} % off pictures of the scene in the light {piece.light!r}"
+            words += "".join(f"\n  {cause}" for cause in piece.causes)
         else:
             name, light = next(iter(lights.items()))
             row = {"light": name, "exposure": export_baked(ready, path, light)}

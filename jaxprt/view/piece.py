@@ -12,7 +12,6 @@ import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -20,9 +19,10 @@ from jaxprt import require
 from jaxprt.files import outputs
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, Mesh
-from jaxprt.view import browser, messages, stages
+from jaxprt.view import browser, messages, page_error
 from jaxprt.view.content import page_content
 from jaxprt.view.messages import Reply
+from jaxprt.view.page_error import Cause
 from jaxprt.view.reduced import FIRST, MOST_BYTES, PageScene
 from jaxprt.view.session import Session
 from jaxprt.view.stages import counterclockwise
@@ -31,7 +31,6 @@ _SKY_ROWS, _LEAST_SKY_ROWS = 1024, 128  # most rows of a picture of a light; at 
 _SPARE_OF_SKIES = 4096  # bytes for what the page says of them
 _SPARE = 64  # bytes by which the page's size may change when another error is written into it
 _SMOOTHEST = 0.25  # least roughness that users of a page can choose: smoother materials vary over a bright texel
-_VIEWS = 4  # views from which the error is measured
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
@@ -165,8 +164,10 @@ class Piece(NamedTuple):
         edge: Texels along a face's edge of the finest visibility in the page; 0 without glossy parts.
         texels: Whether the brightest texels of the light are summed one by one, for sharp shadows of a small sun.
         degree: Highest degree of the transfer matrices in the page; None without parts of the harmonic system.
-        error: Relative L2 error of the page's vertex radiance against that of the scene, over four views and for the
-            light with the largest error.
+        error: Relative L2 error of the page's pictures against those of the scene, over four views and for the light
+            with the largest error, at pixels that show surfaces.
+        light: Name of this light.
+        causes: What the page lacks, with the error that it causes, if `error` is above 5 %; largest first.
     """
 
     path: pathlib.Path
@@ -175,6 +176,8 @@ class Piece(NamedTuple):
     texels: bool
     degree: int | None
     error: float
+    light: str
+    causes: tuple[Cause, ...]
 
 
 def export(
@@ -183,6 +186,7 @@ def export(
     *,
     environments: Mapping[str, Environment] | None = None,
     most: int = 32_000_000,
+    error: float | None = None,
 ) -> Piece:
     """Writes an HTML page that shows and relights a scene on the browser's GPU, without Python.
 
@@ -198,19 +202,23 @@ def export(
         path: The file, `*.html`.
         environments: Dictionary from names to lights; the scene's own or the two embedded ones if None.
         most: Largest size of the file in bytes.
+        error: Largest accepted relative L2 error of the page's pictures against those of `RelitScene.picture`; None
+            accepts any.
 
     Returns:
         A description of the page, with its size and its error against the scene, which includes what is left out.
 
     Raises:
-        TypeError: `scene` is not a relit scene, `path` is not a path, `most` is not a number, or `environments` holds
-            something other than lights.
-        ValueError: The suffix of the file is not .html, a part has another system or is anisotropic, or the page does
-            not fit into `most` bytes.
+        TypeError: `scene` is not a relit scene, `path` is not a path, `most` or `error` is not a number, or
+            `environments` holds something other than lights.
+        ValueError: The suffix of the file is not .html, a part has another system or is anisotropic, the page does not
+            fit into `most` bytes, or its error is larger than `error`. The message then has the causes.
         OSError: The file cannot be written, found before the page is computed where possible.
     """
     require.kind("the scene", scene, RelitScene, source="jaxprt.precompute")
     require.number("most", most, 1.0)
+    if error is not None:
+        require.number("error", error, 0.0)
     path = outputs.target(path, ".html")
     scene = scene.centered()
     absent = [name for name, light in (("bounces", scene.bounces), ("lamps", scene.lamps)) if light is not None]
@@ -228,17 +236,18 @@ def export(
         least = len(_page(session, reduced, lights, contents, error=0.0, title=path.stem))
         if least > most + _SPARE:
             continue
-        relit = reduced.relit()
-        error = max(_error(scene, relit, light) for light in lights.values())
-        page = _page(session, reduced, lights, contents, error=error, title=path.stem)
+        measured = page_error.measure(scene, reduced.relit(), lights)
+        if error is not None and measured.error > error:
+            raise ValueError(measured.refusal(error))
+        page = _page(session, reduced, lights, contents, error=measured.error, title=path.stem)
         least = len(page)
         if least <= most:
             skies = _skies(session, most - least - _SPARE_OF_SKIES)
             if any(sky is not None for sky in skies):
-                page = _page(session, reduced, lights, contents, skies, error=error, title=path.stem)
+                page = _page(session, reduced, lights, contents, skies, error=measured.error, title=path.stem)
                 least = len(page)
             outputs.write(path, page)
-            return Piece(path, least, size.edge, texels, size.degree, error)
+            return Piece(path, least, size.edge, texels, size.degree, *measured)
     raise ValueError(
         f"most must be at least about {least} bytes, the size of the page with the coarsest visibility, got {most}"
     )
@@ -275,19 +284,6 @@ def _sizes(page: PageScene) -> list[_Size]:
             degree -= 1
 
 
-def _error(scene: RelitScene, reduced: RelitScene, light: Environment) -> float:
-    """Relative L2 error over some views around the scene."""
-    off = whole = 0.0
-    for number in range(_VIEWS):
-        turn = stages.about(2 * np.pi * number / _VIEWS)
-        target = jnp.asarray(scene.camera.target)
-        eye = target + turn @ (jnp.asarray(scene.camera.eye) - target)
-        full, approximate = (np.asarray(variant.radiance(light, eye=eye)) for variant in (scene, reduced))
-        full, approximate = np.broadcast_arrays(full, approximate)
-        off, whole = off + float(np.sum((approximate - full) ** 2)), whole + float(np.sum(full**2))
-    return float(np.sqrt(off / whole)) if whole else 0.0
-
-
 def _page(
     session: Session,
     reduced: PageScene,
@@ -309,7 +305,7 @@ def _page(
         "parts": free,
         "systems": {"lobes": {"bounces": False}},
         "rests": [],
-        "note": f"no Python; {100 * error:.1f} % off the whole system",
+        "note": f"no Python; {100 * error:.1f} % off pictures of the scene",
     }
     content = content | {"skies": [None if sky is None else sky.content for sky in skies]}
     content = content | {"scene": head}

@@ -1,5 +1,6 @@
 """Pages that relight without Python: what the browser's GPU makes is the radiance of the reduced scene."""
 
+import dataclasses
 import re
 
 import equinox as eqx
@@ -15,7 +16,7 @@ from jaxprt.relit.groups import Place
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
-from jaxprt.view import messages, stages
+from jaxprt.view import messages, page_error, stages
 from jaxprt.view.content import scene_content
 from jaxprt.view.reduced import PageScene
 
@@ -103,13 +104,18 @@ def test_page_makes_the_radiance_of_the_reduced_scene(change, page, systems, lig
     assert off(page.color(message), true) < DISK
 
 
+def caused(piece, name):
+    """The error that something causes alone."""
+    return next(cause.error for cause in piece.causes if cause.name == name)
+
+
 def test_page_makes_the_radiance_of_transfer_matrices(browser, systems, lights, look, tmp_path):
     scene = systems["harmonics"]
     whole = view.export(scene, tmp_path / "whole.html", environments=lights)
     small = view.export(scene, tmp_path / "small.html", environments=lights, most=whole.nbytes - 5000)
     assert (whole.degree, small.degree) == (2, 1)
-    assert whole.error < 5e-3  # of bytes
-    assert small.error > 2e-2
+    assert caused(whole, "visibility") < 5e-3  # of bytes
+    assert caused(small, "visibility") > 2e-2
     changes = {"turn": np.pi / 2}, {"eye": [-1.0, 3.0, -2.0], "materials": {"ball": MATERIALS}}, {"lamps": LAMPS}
     for piece in (whole, small):
         page = Page(browser, piece.path)
@@ -164,17 +170,57 @@ def test_lobes_and_matrices_share_a_page_and_exponents_change(browser, mixed, li
     page.page.close()
 
 
-def test_error_is_told_against_the_whole_scene(made, systems, lights):
-    scene, reduced = systems["lobes"], PageScene.of(systems["lobes"]).reduced(2, texels=True).relit()
+def picture_error(scene, page, light, *, edge):
+    """Relative L2 error of pictures of a reduced scene from four sides, at pixels that show surfaces."""
     apart = norm = 0.0
     for quarter in range(4):
-        turn = stages.about(quarter * np.pi / 2)
-        eye = turn @ scene.camera.eye  # the camera looks at the origin
-        full, found = (np.asarray(each.radiance(lights["lamp"], eye=eye)) for each in (scene, reduced))
-        apart, norm = apart + np.sum((found - full) ** 2), norm + np.sum(full**2)
-    assert made.error >= 0.99 * np.sqrt(apart / norm)
+        eye = stages.about(quarter * np.pi / 2) @ scene.camera.eye  # the camera looks at the origin
+        camera = dataclasses.replace(scene.camera, eye=eye, width=edge, height=edge)
+        shown = np.asarray(scene.coverage(camera, samples=1))[..., None]
+        full = scene.picture(light, camera, samples=1)
+        approximate = page.picture(light, camera, samples=1, shadows="vertices")
+        apart += float(np.sum(shown * (approximate - full) ** 2))
+        norm += float(np.sum(shown * np.asarray(full) ** 2))
+    return np.sqrt(apart / norm)
+
+
+SMALLER = 0.03  # Pictures of 64 x 64 pixels have other edges than those of 96 x 96.
+
+
+def test_error_is_of_pictures_in_the_light_with_the_largest(made, systems, lights):
+    scene, page = systems["lobes"], PageScene.of(systems["lobes"]).reduced(2, texels=True).relit()
+    errors = {name: picture_error(scene, page, light, edge=64) for name, light in lights.items()}
+    assert made.light == max(errors, key=errors.get)
+    assert made.error == pytest.approx(errors[made.light], rel=SMALLER)
     assert made.edge == 2
     assert made.nbytes == made.path.stat().st_size
+
+
+def test_causes_are_what_the_page_lacks(made, systems, lights):
+    scene, light = systems["lobes"].without_bounces(), lights["lamp"]
+    causes = {cause.name: cause for cause in made.causes}
+    assert list(causes) == sorted(causes, key=lambda name: -causes[name].error)
+    assert set(causes) == {"shadows", "bounces", "visibility"}
+    # The ground has four vertices, none in the shadow of the ball.
+    assert made.causes[0].name == "shadows"
+    assert causes["shadows"].part == "ground"
+    assert causes["shadows"].error == pytest.approx(made.error, rel=0.1)
+    assert "shadows that lie between vertices" in str(causes["shadows"])
+    page = PageScene.of(systems["lobes"]).reduced(2, texels=True).relit()
+    alone = page_error.measure(scene, page, {"lamp": light})
+    assert {cause.name for cause in alone.causes} == {"shadows", "visibility"}
+
+
+def test_larger_errors_than_accepted_are_refused_with_their_causes(systems, lights, made, tmp_path):
+    path = tmp_path / "a.html"
+    with pytest.raises(ValueError, match=r"error must be at least 0\.\d+ for this page, got 0\.05: .*'lamp'") as refused:
+        view.export(systems["lobes"], path, environments=lights, error=0.05)
+    assert "most of it on part 'ground'" in str(refused.value)
+    assert not path.exists()
+    accepted = view.export(systems["lobes"], path, environments=lights, error=made.error)
+    assert accepted.error == made.error
+    with pytest.raises(ValueError, match="error must be at least 0 .*, got -1"):
+        view.export(systems["lobes"], path, environments=lights, error=-1)
 
 
 def test_page_asks_for_nothing(made):
@@ -269,7 +315,7 @@ def test_matte_scene_needs_no_visibility(browser, lights, look, tmp_path):
     made = prt.precompute(scene, refine=False, system=prt.relit.Harmonics(3), size=8, progress=False)
     piece = view.export(made, tmp_path / "matte.html", environments=lights)
     assert piece.edge == 0
-    assert piece.error < 0.01
+    assert caused(piece, "visibility") < 0.01
     page = Page(browser, piece.path)
     true = made.radiance(lights["lamp"], eye=jnp.asarray(look["eye"]))
     assert off(page.color(look), np.asarray(true)) < 0.01

@@ -1,0 +1,168 @@
+"""The error of an exported page: its pictures against those of the scene, and what causes the difference."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxprt.image.pixels import nearest_fragments
+from jaxprt.relit.casting import caster
+from jaxprt.relit.groups import faces_of
+from jaxprt.relit.scene import RelitScene
+from jaxprt.scene import Camera, Environment, sides
+from jaxprt.view import stages
+
+NOTABLE = 0.05  # relative L2 error above which causes are measured
+_VIEWS = 4  # views around the scene
+_EDGE = 96  # edge of the pictures in pixels
+_SMALL = 0.2  # of the error: causes below it are not named
+_REMEDIES = {
+    "shadows": "edges of shadows that lie between vertices: divide the meshes finer (refine)",
+    "bounces": "light that parts reflect onto each other, of which the page has none: precompute without bounces",
+    "lamps": "light of lamps, of which the page has none: show the scene in the viewer instead",
+    "layers": "clear coats and sheens, which the page leaves out: give the parts materials without them",
+    "visibility": "coarse visibility and tables: allow the page more bytes (most), or take more lobes (lobes)",
+}
+
+
+class Cause(NamedTuple):
+    """Something that a page lacks or has coarser than the scene.
+
+    Attributes:
+        name: "shadows", "bounces", "lamps", "layers" or "visibility".
+        error: Relative L2 error of pictures that it causes alone.
+        part: Name of the part that shows most of it.
+    """
+
+    name: str
+    error: float
+    part: str
+
+    def __str__(self) -> str:
+        """The cause with its error and its remedy."""
+        return f"{100 * self.error:.1f} % by {_REMEDIES[self.name]}; most of it on part {self.part!r}"
+
+
+class PageError(NamedTuple):
+    """Error of a page.
+
+    Attributes:
+        error: Relative L2 error of its pictures under the light with the largest error, at pixels that show surfaces.
+        light: Name of this light.
+        causes: The causes, largest first. They are measured if the error is above 5 %, else there are none.
+    """
+
+    error: float
+    light: str
+    causes: tuple[Cause, ...]
+
+    def refusal(self, largest: float) -> str:
+        """The message for a page whose error is larger than the accepted one."""
+        rows = "".join(f"\n  {cause}" for cause in self.causes if cause.error > _SMALL * self.error)
+        return (
+            f"error must be at least {np.ceil(1000 * self.error) / 1000:.3f} for this page, got {largest:g}: its "
+            f"pictures are {100 * self.error:.1f} % off those of the scene in the light {self.light!r}{rows}"
+        )
+
+
+class _Views(NamedTuple):
+    """Small pictures around a scene, at the pixels that show surfaces.
+
+    Attributes:
+        cameras: One for each picture.
+        pixel: Pixels of each picture that show surfaces.
+        part: Part that each of these shows, of all pictures one after another.
+    """
+
+    cameras: Sequence[Camera]
+    pixel: Sequence[Int[np.ndarray, " _"]]
+    part: Int[np.ndarray, " n"]
+
+    @classmethod
+    def around(cls, scene: RelitScene) -> "_Views":
+        """Views in equal turns around the target of the scene's camera."""
+        cameras, pixels, parts = [], [], []
+        hidden = faces_of(scene.mesh, np.repeat(sides.hidden_backs(scene.scene), scene.place.counts))
+        occluder = None if scene.mesh.opacity is None else caster(scene.mesh).occluder
+        owner = np.repeat(np.arange(len(scene.place.counts)), scene.place.counts)[np.asarray(scene.mesh.face)[:, 0]]
+        target = jnp.asarray(scene.camera.target)
+        for number in range(_VIEWS):
+            eye = target + stages.about(2 * np.pi * number / _VIEWS) @ (jnp.asarray(scene.camera.eye) - target)
+            camera = dataclasses.replace(scene.camera, eye=eye, width=_EDGE, height=_EDGE)
+            shown = nearest_fragments(scene.drawn, camera, hidden=np.asarray(hidden), occluder=occluder)
+            triangle = np.asarray(shown.triangle).reshape(-1)
+            pixel = np.flatnonzero(triangle >= 0)
+            cameras.append(camera)
+            pixels.append(pixel)
+            parts.append(owner[triangle[pixel]])
+        return cls(cameras, pixels, np.concatenate(parts))
+
+    def pictures(self, scene: RelitScene, light: Environment, shadows: str) -> Float[np.ndarray, "n 3"]:
+        """Radiance at the pixels that show surfaces."""
+        rows = []
+        for camera, pixel in zip(self.cameras, self.pixel, strict=True):
+            picture = np.asarray(scene.picture(light, camera, samples=1, shadows=shadows), np.float64)
+            rows.append(np.broadcast_to(picture, (*picture.shape[:2], 3)).reshape(-1, 3)[pixel])
+        return np.concatenate(rows)
+
+
+def measure(scene: RelitScene, page: RelitScene, lights: Mapping[str, Environment]) -> PageError:
+    """Measures the pictures of a page against those of the scene, over four views around it.
+
+    Pictures of the scene trace the shadows of bright texels and reflections from each pixel. Pixels of the page
+    interpolate what its vertices store.
+
+    Args:
+        scene: The scene, with its origin at zero.
+        page: The scene as the page relights it.
+        lights: The lights of the page.
+    """
+    views = _Views.around(scene)
+    error, name, whole, off = -1.0, "", np.zeros((1, 3)), np.zeros((1, 3))
+    for key, light in lights.items():
+        right = views.pictures(scene, light, "rays")
+        wrong = views.pictures(page, light, "vertices") - right
+        now = _relative(wrong, right)
+        if now > error:
+            error, name, whole, off = now, key, right, wrong
+    causes = _causes(views, scene, lights[name], whole, off) if error > NOTABLE else ()
+    return PageError(error, name, causes)
+
+
+def _relative(off: Float[np.ndarray, "n 3"], whole: Float[np.ndarray, "n 3"]) -> float:
+    size = float(np.linalg.norm(whole))
+    return float(np.linalg.norm(off)) / size if size else 0.0
+
+
+def _causes(
+    views: _Views,
+    scene: RelitScene,
+    light: Environment,
+    whole: Float[np.ndarray, "n 3"],
+    off: Float[np.ndarray, "n 3"],
+) -> tuple[Cause, ...]:
+    """What the page lacks, one after another: what each step from the scene to the page changes."""
+    now = views.pictures(scene, light, "vertices")
+    steps = {"shadows": whole - now}
+    if scene.bounces is not None:
+        scene, before = scene.without_bounces(), now
+        now = views.pictures(scene, light, "vertices")
+        steps["bounces"] = before - now
+    if scene.lamps is not None:
+        scene, before = scene.without_lamps(), now
+        now = views.pictures(scene, light, "vertices")
+        steps["lamps"] = before - now
+    rest = now - (whole + off)
+    layered = np.asarray([shading.layered for shading in scene.shading])[views.part][:, None]
+    if layered.any():
+        steps["layers"] = rest * layered
+    steps["visibility"] = rest * ~layered
+    names, size = scene.scene.names, max(float(np.linalg.norm(whole)), 1e-30)
+    causes = []
+    for name, step in steps.items():
+        of_part = np.bincount(views.part, np.sum(step**2, 1), len(names))
+        causes.append(Cause(name, float(np.sqrt(of_part.sum())) / size, names[int(np.argmax(of_part))]))
+    return tuple(sorted(causes, key=lambda cause: -cause.error))
