@@ -14,9 +14,10 @@ from jaxprt.cli.options import option
 from jaxprt.files import outputs
 from jaxprt.scene import Environment, light_probe
 from jaxprt.scene.light_probes import TOOLS
-from jaxprt.view import export, export_baked, page_error
+from jaxprt.view import export, export_baked, export_gltf, gltf, page_error
 
 _KINDS = {".html": "page", ".glb": "baked", ".json": "probes"}
+_BAKED, _TRANSFER = "baked", "gltf"  # formats of *.glb
 
 
 @click.command(cls=options.Command, short_help="Export web pages, baked glTF, and light probes.")
@@ -32,9 +33,23 @@ _KINDS = {".html": "page", ".glb": "baked", ".json": "probes"}
     metavar="FILE",
     help="File to write: *.html, *.glb or *.json. May be given several times.",
 )
-@options.systems(
-    ("lobe", "harmonic", "dynamic"), default="lobe", words="Of the page and the baked scene.  [default: lobe]"
+@option(
+    "--format",
+    group="Output",
+    type=click.Choice([_BAKED, _TRANSFER]),
+    default=_BAKED,
+    show_default=True,
+    help="What *.glb holds: colors of one light and view, or transfer in vertex attributes and materials.",
 )
+@option(
+    "--degree",
+    group="Output",
+    type=options.Whole(0, gltf.MOST_DEGREE),
+    default=gltf.DEGREE,
+    show_default=True,
+    help="Degree of the harmonics of the transfer in *.glb.",
+)
+@options.systems(("lobe", "harmonic", "dynamic"), default="lobe", words="Of pages and scenes.  [default: lobe]")
 @option(
     "--bounces",
     group="System",
@@ -81,13 +96,15 @@ def command(**arguments: Any) -> None:
     \b
     *.html  a page that relights the scene in any browser, without Python and offline; it is written if its pictures are
           at most --error off those of the scene
-    *.glb   the scene as glTF, with the radiance under the first light as vertex colors
+    *.glb   the scene as glTF, with the radiance under the first light as vertex colors; with --format gltf its
+          materials, and transfer in vertex attributes, for shaders of other programs
     *.json  light probes: nine spherical harmonics of each light, in the scaling and axes of other tools
 
     \b
     Examples:
       jaxprt export scene.glb grace.hdr --output piece.html
       jaxprt export scene.glb grace.hdr --output piece.html --output baked.glb --system harmonic --store kept
+      jaxprt export scene.glb grace.hdr --format gltf --output prt.glb
       jaxprt export grace.hdr uffizi.hdr --output probes.json --tool three.js
     """  # noqa: D301
     chosen = SimpleNamespace(**arguments)
@@ -147,6 +164,11 @@ def _write(chosen: SimpleNamespace) -> list[dict[str, Any]]:
             row = {"error": piece.error, "causes": causes, "visibility_edge": piece.edge, "degree": piece.degree}
             words = f", {100 * piece.error:.1f} % off pictures of the scene in the light {piece.light!r}"
             words += "".join(f"\n  {cause}" for cause in piece.causes)
+        elif chosen.format == _TRANSFER:
+            kind = "transfer"
+            export_gltf(ready, path, environments=lights, degree=chosen.degree)
+            row = {"degree": chosen.degree}
+            words = f", with transfer of degree {chosen.degree} in vertex attributes, and lights {', '.join(lights)}"
         else:
             name, light = next(iter(lights.items()))
             row = {"light": name, "exposure": export_baked(ready, path, light)}

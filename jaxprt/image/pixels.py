@@ -449,7 +449,7 @@ def visible_points(
     camera: Camera,
     *,
     samples: int,
-    hidden: Bool[np.ndarray, " f"] | None = None,
+    hidden: Bool[np.ndarray, " _"] | None = None,
     occluder: Occluder | None = None,
     uneven: Bool[Array, " f"] | None = None,
     between: Between = None,

@@ -220,6 +220,11 @@ class Exported(eqx.Module):
         return None
 
     @property
+    def diffuse(self) -> Float[np.ndarray, "lm v"]:
+        """Transfer vectors of an ideally diffuse response, in spherical harmonics."""
+        return self.vector
+
+    @property
     def light_size(self) -> int:
         """Edge of the faces of the light that lobes read, in texels; 0 without lobes."""
         return 0

@@ -5,11 +5,12 @@ from typing import Any
 
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment
-from jaxprt.view.piece import Piece, export, export_baked
+from jaxprt.view.gltf import export_baked, export_gltf
+from jaxprt.view.piece import Piece, export
 from jaxprt.view.server import Server
 from jaxprt.view.session import Session
 
-__all__ = ["Piece", "Server", "Session", "export", "export_baked", "serve", "view"]
+__all__ = ["Piece", "Server", "Session", "export", "export_baked", "export_gltf", "serve", "view"]
 
 
 def view(

@@ -62,7 +62,7 @@ def test_without_files_there_are_the_chess_pieces_in_two_lights():
 
 def test_a_page_a_baked_scene_and_probes_are_written(place, capsys):
     out = [place / name for name in ("piece.html", "baked.glb", "probes.json")]
-    files = [str(place / "first.obj"), str(place / "sky.exr"), "--light-size", "8", "--lobes", "1"]
+    files = [str(place / "first.obj"), str(place / "sky.exr"), "--light-size", "8", "--lobes", "1", "--error", "0.15"]
     written = [word for path in out for word in ("--output", str(path))]
     assert main(["export", *files, *written, "--json", "--tool", "three.js,unity"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -75,6 +75,17 @@ def test_a_page_a_baked_scene_and_probes_are_written(place, capsys):
     constant = np.zeros((9, 3))
     constant[0] = 0.5 * np.sqrt(4 * np.pi)  # the light is 0.5 everywhere
     np.testing.assert_allclose(probes["three.js"]["sky"], constant, atol=1e-5)
+
+
+def test_a_scene_with_transfer_is_written(place, capsys):
+    out = place / "prt.glb"
+    given = [str(place / "first.obj"), str(place / "sky.exr"), "--light-size", "8", "--lobes", "1"]
+    assert main(["export", *given, "--format", "gltf", "--degree", "2", "--output", str(out)]) == 0
+    assert "with transfer of degree 2 in vertex attributes, and lights sky" in capsys.readouterr().out
+    data = out.read_bytes()
+    head = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    assert head["asset"]["extras"]["prt"]["degree"] == 2
+    assert {"_PRT_0", "_PRT_1", "_PRT_2"} < set(head["meshes"][0]["primitives"][0]["attributes"])
 
 
 @pytest.mark.parametrize(
@@ -166,3 +177,32 @@ def test_a_port_that_is_taken_is_refused_before_anything_is_computed(monkeypatch
 def test_what_cannot_be_shown_is_an_error(argument, words, capsys):
     assert main(["view", *argument]) == 2
     assert words in capsys.readouterr().err
+
+
+def test_a_page_far_from_the_scene_is_refused_with_the_cause_and_written_where_its_error_is_accepted(
+    data, tmp_path, capsys
+):
+    given = [data / "foreign/craft_speederD.gltf", data / "env/polyhaven_spiaggia_di_mondello_1k.hdr"]
+    page = tmp_path / "ship.html"
+    command = [
+        "export",
+        *map(str, given),
+        "--light-size",
+        "8",
+        "--lobes",
+        "1",
+        "--refine",
+        "off",
+        "--output",
+        str(page),
+    ]
+    assert main(command) == 2
+    told = capsys.readouterr().err
+    assert "error must be at least 0." in told
+    assert "for this page, got 0.05: its pictures are" in told
+    assert "in the light 'polyhaven_spiaggia_di_mondello_1k'" in told
+    assert "% by edges of shadows that lie between vertices: divide the meshes finer (refine)" in told
+    assert not page.exists()
+    assert main([*command, "--error", "1"]) == 0
+    assert page.exists()
+    assert "edges of shadows that lie between vertices" in capsys.readouterr().out

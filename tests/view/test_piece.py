@@ -213,14 +213,15 @@ def test_causes_are_what_the_page_lacks(made, systems, lights):
 
 def test_larger_errors_than_accepted_are_refused_with_their_causes(systems, lights, made, tmp_path):
     path = tmp_path / "a.html"
-    with pytest.raises(ValueError, match=r"error must be at least 0\.\d+ for this page, got 0\.05: .*'lamp'") as refused:
+    refusal = r"error must be at least 0\.\d+ for this page, got 0\.05: .*'lamp'"
+    with pytest.raises(ValueError, match=refusal) as refused:
         view.export(systems["lobes"], path, environments=lights, error=0.05)
     assert "most of it on part 'ground'" in str(refused.value)
     assert not path.exists()
     accepted = view.export(systems["lobes"], path, environments=lights, error=made.error)
     assert accepted.error == made.error
-    with pytest.raises(ValueError, match="error must be at least 0 .*, got -1"):
-        view.export(systems["lobes"], path, environments=lights, error=-1)
+    with pytest.raises(ValueError, match=r"error must be at least 0 .*, got -1.0"):
+        view.export(systems["lobes"], path, environments=lights, error=-1.0)
 
 
 def test_page_asks_for_nothing(made):

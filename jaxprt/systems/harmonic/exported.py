@@ -56,6 +56,16 @@ class ExportedMatrices(Exported):
         return self.brdf.table.shape[1]
 
     @property
+    def diffuse(self) -> Float[np.ndarray, "lm v"]:
+        """Transfer vectors of an ideally diffuse response: the matrices times a clamped cosine about the normal."""
+        degree = self.system.degree
+        band = np.arange(degree + 1)
+        upright = np.sqrt((2 * band + 1) / (4 * np.pi))  # harmonics of order zero in the direction of the normal
+        factor = np.asarray(harmonics.cosine(degree=degree), np.float64) / np.pi * upright
+        matrix = np.asarray(self.system.transport.matrix, np.float64)[:, 0]
+        return np.einsum("l,vli->iv", factor, matrix[:, band * (band + 1)])
+
+    @property
     def degree(self) -> int:
         """Degree of the matrices."""
         return harmonics.degree_of(len(self.visible)) // 2
