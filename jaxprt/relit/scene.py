@@ -194,11 +194,6 @@ class RelitScene(System):
         surfaces = tuple(dataclasses.replace(surface, reflecting=None) for surface in self.surfaces)
         return self._replaced(surfaces=surfaces, bounces=None)
 
-    def without_lamps(self) -> "RelitScene":
-        """The scene without the light of its lamps. Parts that emit still show their emission."""
-        surfaces = tuple(dataclasses.replace(surface, lit=None) for surface in self.surfaces)
-        return self._replaced(surfaces=surfaces, lamps=None)
-
     def _replaced(self, **fields: Any) -> "RelitScene":
         """A copy with other fields. Works inside `jax.jit` too, where `__init__` could not measure the curvature."""
         copy = object.__new__(RelitScene)

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -132,6 +133,12 @@ def measure(scene: RelitScene, page: RelitScene, lights: Mapping[str, Environmen
     return PageError(error, name, causes)
 
 
+def _without_lamps(scene: RelitScene) -> RelitScene:
+    """The scene without the light of its lamps. Parts that emit still show their emission."""
+    surfaces = tuple(dataclasses.replace(surface, lit=None) for surface in scene.surfaces)
+    return eqx.tree_at(lambda relit: (relit.surfaces, relit.lamps), scene, (surfaces, None))
+
+
 def _relative(off: Float[np.ndarray, "n 3"], whole: Float[np.ndarray, "n 3"]) -> float:
     size = float(np.linalg.norm(whole))
     return float(np.linalg.norm(off)) / size if size else 0.0
@@ -152,7 +159,7 @@ def _causes(
         now = views.pictures(scene, light, "vertices")
         steps["bounces"] = before - now
     if scene.lamps is not None:
-        scene, before = scene.without_lamps(), now
+        scene, before = _without_lamps(scene), now
         now = views.pictures(scene, light, "vertices")
         steps["lamps"] = before - now
     rest = now - (whole + off)
