@@ -325,6 +325,8 @@ def test_a_picture_of_any_size_is_saved_with_alpha(hand, systems, lights, sessio
 def test_an_exported_page_saves_pictures_by_its_graphics_card(browser, systems, lights, tmp_path):
     piece = view.export(systems["harmonics"], tmp_path / "page.html", environments=lights)
     hand = Hand(browser, piece.path.as_uri())
+    hand.page.wait_for_function(f"() => ({CANVAS}).pixels().stats.samples === 9", timeout=60_000)
+    hand.page.wait_for_timeout(300)
     shown = hand.pixels()
     height, width = shown.shape[:2]
     picture = saved(hand, width, height, transparent=False)

@@ -47,6 +47,7 @@ void main(){ o = vec4(display(textureLod(image, vec2(at.x, 1. - at.y), 0.).rgb),
 
 export const TONES = ["srgb", "filmic", "agx", "aces"];
 
+const MOST_PIXELS = 2 ** 24; // of a picture that is saved
 const FADE = 200; // milliseconds in which a picture at rest appears
 
 export class Drawing {
@@ -161,7 +162,7 @@ export class Drawing {
       gl.uniform1f(this.sky.at("lod"), Math.log2((2 * Math.tan(camera.angle / 2) * this.skyHeight) / (height * Math.PI)));
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
-    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+    gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     if (image) {
       gl.enable(gl.BLEND);
       this.quad(this.shaded, image.made, gain, false, tone);
@@ -202,8 +203,19 @@ export class Drawing {
     gl.disable(gl.BLEND);
     return more || alpha < 1;
   }
-  // Bytes, RGBA from the lower left, of what is painted at a size of its own. Alpha is 0 where there is only the ground.
-  pixels(camera, state, center, { width, height }) {
+  // A picture of any size as rows of RGBA from below, colors times alpha, and how many of its pixels make one along an edge.
+  async picture(camera, state, center, width, height) {
+    const { gl, gpu } = this, most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    if (Math.max(width, height) > most || width * height > MOST_PIXELS)
+      throw new Error(`a picture must have at most ${MOST_PIXELS} pixels, and ${most} along an edge in this browser, got ${width} x ${height}`);
+    if (!gpu?.floats) return { pixel: this.pixels(camera, state, center, { width: 2 * width, height: 2 * height }), parts: 2 };
+    const image = await gpu.whole(camera.matrix(width / height, center), width, height), pixel = this.pixels(camera, state, center, { width, height }, image);
+    gpu.dispose();
+    return { pixel, parts: 1 };
+  }
+  // Bytes, RGBA from the lower left, of what is painted at a size of its own: an image of shaded pixels, or colors at
+  // vertices without one. Alpha is 0 where there is only the ground.
+  pixels(camera, state, center, { width, height }, image = null) {
     const gl = this.gl, most = gl.getParameter(gl.MAX_RENDERBUFFER_SIZE), samples = Math.min(4, gl.getParameter(gl.MAX_SAMPLES));
     if (Math.max(width, height) > most) throw new Error(`a picture must have at most ${most} pixels along an edge in this browser, got ${width} x ${height}`);
     const buffer = (count, kind, place) => {
@@ -214,10 +226,10 @@ export class Drawing {
       return made;
     };
     const [many, one] = [gl.createFramebuffer(), gl.createFramebuffer()], result = new Uint8Array(4 * width * height);
-    if (this.gpu) this.gpu.piece.vertices(this.gpu.message);
+    if (this.gpu && !image) this.gpu.piece.vertices(this.gpu.message);
     gl.bindFramebuffer(gl.FRAMEBUFFER, many);
     const buffers = [buffer(samples, gl.RGBA8, gl.COLOR_ATTACHMENT0), buffer(samples, gl.DEPTH_COMPONENT24, gl.DEPTH_ATTACHMENT)];
-    this.paint(camera, state, center, { width, height }, [0, 0, 0, 0]);
+    this.paint(camera, state, center, { width, height }, [0, 0, 0, 0], image);
     gl.bindFramebuffer(gl.FRAMEBUFFER, one);
     buffers.push(buffer(0, gl.RGBA8, gl.COLOR_ATTACHMENT0));
     gl.bindFramebuffer(gl.READ_FRAMEBUFFER, many);

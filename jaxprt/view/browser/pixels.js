@@ -90,7 +90,8 @@ export class Pixels {
     this.stale = true;
   }
   // Whether the GPU is still at what it was given.
-  get busy() {
+  get busy() { return this.held || this.working; }
+  get working() {
     const { gl, fence } = this;
     if (!fence) return false;
     if (gl.getSyncParameter(fence.sync, gl.SYNC_STATUS) !== gl.SIGNALED) return true;
@@ -156,8 +157,7 @@ export class Pixels {
   // One strip of the picture at rest; each sample counts as much as those before.
   refine(matrix, width, height) {
     this.piece.shine(this.message);
-    const jitter = JITTER[this.sample], moved = Float32Array.from(matrix);
-    for (let j = 0; j < 4; j++) for (let c = 0; c < 2; c++) moved[4 * j + c] += ((2 * jitter[c]) / [width, height][c]) * matrix[4 * j + 3];
+    const moved = jittered(matrix, JITTER[this.sample], width, height);
     if (!this.row) this.find(moved, width, height, width, height);
     const image = this.image("rest", width, height), rows = clamp(Math.floor(this.strip / width), 1, height - this.row);
     this.shade(image, moved, this.row, rows, 1 / (this.sample + 1));
@@ -169,6 +169,37 @@ export class Pixels {
       this.shown = image;
     }
     this.sent(false);
+  }
+  // A picture of a size of its own, as at rest. Frames wait for it. `dispose` is to be called once it has been read.
+  async whole(matrix, width, height) {
+    const { gl } = this;
+    while (this.busy) await new Promise(requestAnimationFrame);
+    this.held = true;
+    try {
+      for (const [sample, jitter] of JITTER.entries()) {
+        const moved = jittered(matrix, jitter, width, height);
+        this.piece.shine(this.message);
+        this.find(moved, width, height, width, height);
+        if (gl.getError() === gl.OUT_OF_MEMORY) throw new Error(`this browser's GPU has no memory for ${width} x ${height} pixels`);
+        const image = this.image("saved", width, height);
+        for (let row = 0, rows; row < height; row += rows) {
+          rows = clamp(Math.floor(this.strip / width), 1, height - row);
+          this.shade(image, moved, row, rows, 1 / (sample + 1));
+          this.sent(false);
+          while (this.working) await new Promise(requestAnimationFrame);
+        }
+      }
+      return this.images.saved;
+    } finally {
+      this.held = false;
+      this.stale = true; // the triangles of frames are lost
+    }
+  }
+  dispose() {
+    const { made, frame } = this.images.saved;
+    this.gl.deleteTexture(made);
+    this.gl.deleteFramebuffer(frame);
+    delete this.images.saved;
   }
   image(name, width, height) {
     const gl = this.gl, held = this.images[name];
@@ -260,6 +291,13 @@ export function drawSides(gl, backs, count, draw) {
   draw(count);
   gl.disable(gl.CULL_FACE);
   gl.disable(gl.DEPTH_TEST);
+}
+
+// The matrix of a camera whose pixels lie a little aside.
+function jittered(matrix, jitter, width, height) {
+  const moved = Float32Array.from(matrix);
+  for (let j = 0; j < 4; j++) for (let c = 0; c < 2; c++) moved[4 * j + c] += ((2 * jitter[c]) / [width, height][c]) * matrix[4 * j + 3];
+  return moved;
 }
 
 // The rectangle of pixels in which a box is seen: left, low, right, high.

@@ -262,13 +262,16 @@ export function mount(root, ask) {
   // A picture of any size as a file: by Python where there is one, else by the graphics card.
   const picture = async ({ width, height, transparent }) => {
     if (!scene) throw new Error("there is no scene yet");
-    if (!scene.rests.includes("picture")) return drawn(drawing, camera, { ...state, background: !transparent }, scene.center, width, height);
     busy(`a picture of ${width} x ${height} pixels`);
     try {
+      if (!scene.rests.includes("picture")) return await drawn(drawing, camera, { ...state, background: !transparent }, scene.center, width, height);
       const { content, buffers } = await ask({ ...message("picture"), stops: state.stops, width, height, transparent });
       if (content.kind === "error") throw new Error(content.message);
       return new Blob([buffers[0]], { type: "image/png" });
-    } finally { busy(""); }
+    } finally {
+      busy("");
+      redraw();
+    }
   };
   let controls = null;
   const start = async () => {
@@ -311,16 +314,15 @@ export function mount(root, ask) {
   return () => { closed = true; watch.disconnect(); view.close(); hands(); clearTimeout(stillTimer); drawing.close(); };
 }
 
-// A picture that the graphics card draws, at twice the size and then reduced, as a PNG file.
+// A picture that the graphics card draws, as a PNG file.
 async function drawn(drawing, camera, state, center, width, height) {
-  const large = { width: 2 * width, height: 2 * height }, pixel = drawing.pixels(camera, state, center, large), row = 8 * width;
+  const { pixel, parts } = await drawing.picture(camera, state, center, width, height), row = 4 * parts * width;
   const canvas = Object.assign(document.createElement("canvas"), { width, height }), context = canvas.getContext("2d"), image = context.createImageData(width, height);
   for (let y = 0, to = 0; y < height; y++) for (let x = 0; x < width; x++, to += 4) {
-    const low = 2 * (height - 1 - y) * row + 8 * x; // rows come from below
-    let alpha = 0;
-    for (const from of [low, low + 4, low + row, low + row + 4]) alpha += pixel[from + 3];
-    for (let c = 0; c < 3; c++) image.data[to + c] = alpha && (255 * (pixel[low + c] + pixel[low + 4 + c] + pixel[low + row + c] + pixel[low + row + 4 + c])) / alpha;
-    image.data[to + 3] = alpha / 4;
+    const low = parts * ((height - 1 - y) * row + 4 * x), sum = [0, 0, 0, 0]; // rows come from below
+    for (let i = 0; i < parts; i++) for (let j = 0; j < parts; j++) for (let c = 0; c < 4; c++) sum[c] += pixel[low + i * row + 4 * j + c];
+    for (let c = 0; c < 3; c++) image.data[to + c] = sum[3] && (255 * sum[c]) / sum[3];
+    image.data[to + 3] = sum[3] / parts ** 2;
   }
   context.putImageData(image, 0, 0);
   const file = await new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
