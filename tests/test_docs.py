@@ -7,6 +7,7 @@ the names in `FILES`. Lights, maps and tables are bound to small sizes; the code
 import collections
 import gc
 import importlib
+import json
 import linecache
 import os
 import pathlib
@@ -24,6 +25,7 @@ import trimesh
 import jaxprt as prt
 from jaxprt.files import extensions
 from jaxprt.relit import Clusters, Harmonics, recipes, registry
+from jaxprt.scene.formats import nerf
 
 pytestmark = pytest.mark.documents
 
@@ -33,6 +35,7 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
 PAGES += [page for page in sorted(DOCS.rglob("*.md")) if page.relative_to(DOCS).parts[0] not in ("notebooks", "_build")]
 FILES = ("scene.glb", "mesh.ply", "mesh.obj", "light.hdr", "light.exr", "sky.hdr", "measured.brdf", "photograph.exr")
+FILES += ("transforms.json",)
 MOST_LINES_OF_README = 150
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
@@ -150,6 +153,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     system = prt.harmonic.DiffuseSystem(prt.harmonic.precompute_diffuse(mesh, size=8), jnp.full(3, 0.5))
     camera = prt.scene.camera.orbit(mesh, azimuth=0.5, elevation=0.3, width=64, height=64)
     light = prt.load_environment(folder / "light.exr", size=8)
+    frames = nerf.content([camera], [{"file_path": "./0000_light.exr"}], [0])
+    (folder / "transforms.json").write_text(json.dumps(frames))
     image = prt.image.render(mesh, prt.radiance(system, light, eye=camera.eye), camera)
     prt.files.write_exr(folder / "photograph.exr", np.asarray(image)[..., :3])
     assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)

@@ -11,7 +11,7 @@ import tqdm
 from click.shell_completion import get_completion_class
 
 import jaxprt
-from jaxprt.cli import export, info, inputs, measure, options, planned, play, relight
+from jaxprt.cli import dataset, export, info, inputs, measure, options, planned, play, relight
 from jaxprt.relit import registry
 
 _SHELLS = {"bash": "~/.bashrc", "zsh": "~/.zshrc", "fish": "~/.config/fish/completions/jaxprt.fish"}
@@ -100,6 +100,7 @@ for _name, _command in {
     "plan": planned.command,
     "measure": measure.command,
     "export": export.command,
+    "dataset": dataset.command,
     "info": info.command,
     "completion": completion,
 }.items():

@@ -338,6 +338,13 @@ scene = together(
         help="Material of one part, given by its name or its number from 0.",
     ),
 )
+light_size = option(
+    "--light-size",
+    group="Light",
+    type=Whole(1, 1024),
+    metavar="N",
+    help="Texels along the edge of the light's cubemap faces, a power of two.  [default: 64]",
+)
 light = together(
     option(
         "--turn",
@@ -347,13 +354,7 @@ light = together(
         metavar="DEGREES,..",
         help="Rotate each light by each angle about the vertical, counterclockwise as seen from above.",
     ),
-    option(
-        "--light-size",
-        group="Light",
-        type=Whole(1, 1024),
-        metavar="N",
-        help="Texels along the edge of the light's cubemap faces, a power of two.  [default: 64]",
-    ),
+    light_size,
 )
 camera = together(
     option(

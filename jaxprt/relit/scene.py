@@ -608,7 +608,7 @@ class RelitScene(System):
         return pictures.folded(cover[..., None], fold=fold)[..., 0]
 
     @promoted
-    def exposure(self, picture: Float[Array, "h w c"], camera: Camera | None = None) -> Float[Array, ""]:
+    def exposure(self, picture: Float[Array | np.ndarray, "h w c"], camera: Camera | None = None) -> Float[Array, ""]:
         """Exposure of a picture in stops that brings the brightest surfaces near white, whatever is behind them.
 
         `jaxprt.image.display(picture, stops=relit.exposure(picture))` shows the picture. It is
