@@ -1,22 +1,32 @@
 """Pixels that the browser's GPU shades are those of the scene as the page holds it, and nearly those of the scene."""
 
 import base64
+from collections import Counter
 
 import equinox as eqx
 import numpy as np
 import pytest
 
 import jaxprt as prt
+from jaxprt import image
+from jaxprt.compile import put
+from jaxprt.relit.build import shaded as shaded_parts
+from jaxprt.relit.groups import Place
+from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
+from jaxprt.view import Server, Session, messages, stages
 from jaxprt.view import browser as modules
-from jaxprt.view import messages, stages
 from jaxprt.view.content import page_content
 from jaxprt.view.reduced import PageScene
+from tests.view.test_browser import CANVAS, TOLD, Hand
 
 SIZE = 8  # texels along a face's edge of lights
 WIDTH, HEIGHT = 96, 72
 SAME = 0.01  # of the mean of a picture, between the shader and Python
+
+LINE = "document.querySelector('#viewer').shadowRoot.querySelector('.line').textContent"
+UNSHADOWED = 0.05  # of the mean, for the horizon and the irradiance that are blurred
 
 SHADES = """async ({ module, data, message, angle, radius, backs, size }) => {
   const { Camera, Piece, Pixels, unpack } = await import(module);
@@ -105,17 +115,95 @@ def test_pixels_of_the_browser_are_those_of_python(case, shaded):
     found = shaded(page, relit.mesh, [light()], CAMERA, turn=np.pi / 2)
     turned = rotate(light(), stages.about(np.pi / 2))
     options = {"samples": 1, "shadows": "vertices"}
-    true, whole = (np.asarray(scene.picture(turned, CAMERA, **options)) for scene in (page.relit(), relit))
+    true = np.asarray(page.relit().picture(turned, CAMERA, **options))
     same = inside(np.asarray(relit.coverage(CAMERA, samples=1)) == 1) & inside(found[..., 3] == 1)
     assert np.mean(same) > 0.3
     off = np.abs(found[..., :3] - true)[same]
-    print(
-        case,
-        "mean",
-        off.mean() / true[same].mean(),
-        "max",
-        off.max() / true[same].mean(),
-        "whole",
-        np.abs(found[..., :3] - whole)[same].mean() / whole[same].mean(),
-    )
     assert off.mean() < SAME * true[same].mean()
+
+
+@pytest.mark.parametrize("material", [GLOSSY, METAL, MATTE])
+def test_unshadowed_pixels_are_nearly_those_of_a_ball_that_nothing_shadows(material, shaded):
+    scene = Scene([Part("ball", builtin.sphere(rings=12, sectors=24), material)])
+    relit = prt.precompute(scene, refine=False, system=prt.relit.Lobes(8, texels=2), size=SIZE, progress=False)
+    page = PageScene.without_visibility(scene.parts, shaded_parts(scene.parts, [prt.relit.Lobes()]), SIZE)
+    found = shaded(page, scene.mesh, [light()], CAMERA)
+    true = np.asarray(relit.picture(light(), CAMERA, samples=1, shadows="vertices"))
+    same = inside(np.asarray(relit.coverage(CAMERA, samples=1)) == 1) & inside(found[..., 3] == 1)
+    assert np.mean(same) > 0.1
+    off = np.abs(found[..., :3] - true)[same].mean() / true[same].mean()
+    assert off < UNSHADOWED
+
+
+class Counted(Session):
+    """A session that counts the messages of each kind."""
+
+    def answer(self, message, buffers=()):
+        self.asked = getattr(self, "asked", Counter())
+        self.asked[message.get("kind")] += 1
+        return super().answer(message, buffers)
+
+
+def test_light_view_and_material_change_without_python(browser, systems, lights):
+    bare = systems["lobes"].without_bounces()
+    server = Server(session := Counted(bare, environments=lights))
+    hand = Hand(browser, server.url)
+    hand.page.wait_for_function(f"() => ({CANVAS}).pixels?.()")
+    hand.page.evaluate(f"() => ({CANVAS}).pixels().patient = true")  # however slow it is
+    hand.page.locator("canvas.canvas").focus()
+    hand.page.keyboard.press("p")  # no pictures by Python
+    hand.settle()
+    before = session.asked["look"]
+    hand.drag((100, 100), (160, 130))
+    hand.page.keyboard.press("l")
+    changed = {"ball": {"roughness": 0.7, "diffuse": [0.1, 0.4, 0.3]}}
+    hand.page.evaluate(f"(materials) => {{ Object.assign(({CANVAS}).state, {{ materials }}); }}", changed)
+    hand.page.keyboard.press("l")
+    hand.page.wait_for_function(f"() => ({CANVAS}).pixels().stats.samples > 1", timeout=120_000)
+    assert session.asked["look"] == before
+    assert "GPU" in hand.page.evaluate(LINE)
+    state, camera, found = hand.state(), hand.camera(), hand.pixels()
+    height, width = found.shape[:2]
+    view = Camera(camera["eye"], camera["target"], [0.0, 1.0, 0.0], camera["angle"], width, height)
+    assert state["materials"] == changed
+    materials = {"ball": stages.change_material(bare.scene.parts[0].material, "ball", changed["ball"])}
+    page = PageScene.for_gpu(bare).relit()
+    true = page.picture(lights["lamp"], view, materials=materials, shadows="vertices")
+    off = np.abs(found - np.asarray(image.display(image.expose(true, stops=state["stops"])))).max(-1)
+    assert np.quantile(off, 0.95) < 4 / 255  # edges aside, and half floats
+    context = f"({CANVAS}).getContext('webgl2').getExtension('WEBGL_lose_context')"
+    hand.page.evaluate(f"() => {{ window.loses = {context}; window.loses.loseContext(); }}")
+    hand.page.wait_for_function(f"() => {TOLD}.includes('context was lost')")
+    hand.page.evaluate("() => window.loses.restoreContext()")
+    hand.page.wait_for_function(f"() => ({CANVAS}).pixels().stats.samples > 1", timeout=120_000)
+    assert np.quantile(np.abs(hand.pixels() - found), 0.95) < 2 / 255
+    server.close()
+    hand.page.close()
+    assert not hand.errors
+
+
+def test_what_the_gpu_does_not_hold_comes_from_python_by_name(browser, systems, lights):
+    server = Server(Session(systems["lobes"], environments=lights))
+    hand = Hand(browser, server.url)
+    hand.settle()
+    assert "colors from Python: reflected light" in hand.page.evaluate(LINE)
+    server.close()
+    hand.page.close()
+
+
+def test_why_a_scene_is_not_shaded_by_the_gpu_is_said(systems, lights, look):
+    bare = systems["lobes"].without_bounces()
+    skewed = systems["harmonics"]
+    matrix = put(skewed.part_system(0)).transport.matrix
+    ball = eqx.tree_at(lambda system: system.transport.matrix, put(skewed.part_system(0)), 2 * matrix + matrix[::-1])
+    others = RelitScene(
+        skewed.scene, skewed.shading, Place.apart(skewed.place.counts), (ball, put(skewed.part_system(1)))
+    )
+    session = Session({"lobes": bare, "others": others}, environments=lights)
+    content, buffers = session.answer({"kind": "page", "system": "lobes"})
+    assert (content["kind"], content["visibility"], len(buffers)) == ("page", True, 7 + len(content["rims"]) + 2)
+    content, buffers = session.answer({"kind": "page", "system": "others"})
+    assert "part 'ball' must have the transfer matrices of direct light" in content["missing"]
+    assert not buffers
+    content, _ = session.answer({"kind": "page", "system": "none"})
+    assert "the system must be one of lobes, others, got 'none'" in content["message"]

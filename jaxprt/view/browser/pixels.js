@@ -56,6 +56,7 @@ export class Pixels {
     this.images = {};
     this.triangles = null;
     this.fence = null;
+    this.used = new Set(); // levels that have been seen once
     this.shown = null; // the image that is seen; none while colors at vertices are
     this.stale = Boolean(this.message);
     this.boxes = piece.content.parts.map(({ first, count }) => {
@@ -84,10 +85,13 @@ export class Pixels {
     gl.deleteFramebuffer(triangles.frame);
     this.triangles = null;
   }
+  // Whether frames take long even with colors at vertices.
+  get slow() { return !this.patient && this.used.has(0) && this.level === 0 && this.stats.ms > 2 * SLUGGISH; }
   // The picture has changed: its light, view, materials or size.
   change(message) {
     this.message = message;
     this.stale = true;
+    this.stats.samples = 0;
   }
   // Whether the GPU is still at what it was given.
   get busy() { return this.held || this.working; }
@@ -108,6 +112,7 @@ export class Pixels {
   learn(ms, moving) {
     if (!moving) { this.strip = clamp(ms < BRISK ? 2 * this.strip : ms > 2 * SLUGGISH ? this.strip / 2 : this.strip, 4096, 1 << 22); return; }
     this.stats.ms = ms;
+    if (!this.used.has(this.level)) { this.used.add(this.level); return; } // with the compiler's work
     const now = performance.now(), finer = this.trial[this.level + 1];
     this.quick = ms < BRISK ? this.quick + 1 : 0;
     if (ms > SLUGGISH && this.level > this.least) {
@@ -128,7 +133,6 @@ export class Pixels {
       this.stale = false;
       this.since = now + PAUSE;
       [this.sample, this.row] = [0, 0];
-      this.stats.samples = 0;
       this.move(matrix, width, height);
       return true;
     }

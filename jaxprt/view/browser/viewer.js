@@ -83,7 +83,8 @@ export function mount(root, ask) {
     canvas.pixels = () => gpu;
     if (gpu && scene) moved();
   };
-  const shades = () => gpu !== null && asked === state.system && !state.bounces;
+  // Whether the GPU shades the present state. A slow one leaves it to Python, if that is quicker.
+  const shades = () => gpu !== null && asked === state.system && !state.bounces && !(gpu.slow && scene.rests.length && stats.trip < 2 * gpu.stats.ms);
   const shade = () => {
     stats.sent++;
     gpu.change(message("look"));
@@ -91,7 +92,7 @@ export function mount(root, ask) {
       exposed = state.light;
       find();
     }
-    Object.assign(stats, { got: stats.got + 1, shown: seq, trip: 0 });
+    Object.assign(stats, { got: stats.got + 1, shown: seq });
     tell("");
     const size = gpu.stats.level ? `pixels of ${gpu.stats.level}` : "vertices";
     line.textContent = `${size} by the browser's GPU, ${gpu.stats.ms.toFixed(0)} ms · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}`;
@@ -147,10 +148,11 @@ export function mount(root, ask) {
     else if (stats.shown === seq && partial) look("unseen");
     else if (stats.shown === seq) { sky(); stillTimer = setTimeout(rested, 250); }
   };
+  const why = () => lacking || (state.bounces ? "reflected light" : gpu?.slow ? "the browser has no quick GPU" : "");
   const status = (ms, rate, bytes) => {
     const number = (x) => x.toFixed(x < 10 ? 1 : 0);
     line.textContent = `light ${number(ms.light)} ms · view ${number(ms.view)} ms · combine ${number(ms.combine)} ms · ` +
-      `there and back ${number(stats.trip)} ms · ${rate ? number(rate) + "/s · " : ""}${(bytes / 1024).toFixed(0)} kB · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}${lacking ? ` · colors from Python: ${lacking}` : ""}`;
+      `there and back ${number(stats.trip)} ms · ${rate ? number(rate) + "/s · " : ""}${(bytes / 1024).toFixed(0)} kB · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}${why() ? ` · colors from Python: ${why()}` : ""}`;
   };
   // The light as it is seen: a small picture at once and a fine one at rest, unless the way is long.
   const sky = async (rows = 1) => {
