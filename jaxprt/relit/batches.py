@@ -119,10 +119,10 @@ def blocks(
             count = lights_at_once(camera, memory=memory, layers=layers)
             keeps = count >= len(environments)
             for first in range(0, len(environments), count):
-                lights = np.arange(first, min(first + count, len(environments)))
                 lit = view.remembering(remembered if keeps else {})
-                chosen = [environments[light] for light in lights]
+                chosen = environments[first : first + count]
                 pictures = lit.pictures(chosen, background=background, layers=layers)
+                lights = np.arange(first, first + len(chosen))
                 yield PictureBlock(number, lights, jax.tree.map(lambda *images: np.stack(images), *pictures))
 
 

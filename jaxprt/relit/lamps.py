@@ -72,6 +72,10 @@ class SceneLamps(eqx.Module):
         rows += [changed.get(light.name, light).intensity for light in self.point_lights]
         return jax.device_put(np.stack(rows)) if known(rows) else jnp.stack(rows)
 
+    def names(self, parts: Sequence[str]) -> tuple[str, ...]:
+        """Names of the lamps in their order, from the names of all parts."""
+        return (*(parts[number] for number in self.emitting), *(light.name for light in self.point_lights))
+
     def sources(
         self, appearances: Sequence[Appearance], origin: origins.Origin
     ) -> tuple[tuple[PointLight, ...], Float[Array | np.ndarray, " n"]]:

@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -17,10 +17,12 @@ from jaxprt import require
 from jaxprt.compile import Between, compile_time, finished, jit, known, promoted, put
 from jaxprt.image import raster
 from jaxprt.image.pixels import Pixels, visible_points
-from jaxprt.relit import canvas, curvature, lamplight, shadows, tracing
+from jaxprt.relit import canvas, curvature, groups, lamplight, shadows, tracing
 from jaxprt.relit.casting import caster
-from jaxprt.relit.groups import Arriving, Stage, Surface, look_at, sampled
+from jaxprt.relit.channels import Appearance
+from jaxprt.relit.groups import Arriving, SceneLight, Stage, Surface, look_at, sampled
 from jaxprt.relit.lamplight import LampLight
+from jaxprt.relit.lamps import split
 from jaxprt.relit.picture_layers import LIGHT
 from jaxprt.relit.picture_layers import check as check_layers
 from jaxprt.relit.picture_layers import of_points as geometry_layers
@@ -57,8 +59,8 @@ class PictureView(eqx.Module):
 
     Attributes:
         stage: The scene and its materials.
-        arriving: Function from an environment to the light that arrives at the scene; its second argument, if it is not
-            None, takes the place of the environment in direct light.
+        arriving: Function from an environment to the light that arrives at the scene. Its second argument, if it is not
+            None, takes the place of the environment in direct light, and its third is the share of each lamp.
         camera: The camera of the drawn pixels.
         pixels: The points of the picture.
         ray: Unit direction in world space from the eye through the center of each drawn pixel.
@@ -69,10 +71,11 @@ class PictureView(eqx.Module):
         keep: Whether what does not depend on the light is kept.
         shares: The texels that were traced when the view was made; None to choose them by each light.
         lamp_rays: Whether rays from the points are traced to lamps; otherwise their light is interpolated.
+        lamps: Names of the lamps.
     """
 
     stage: Stage
-    arriving: Callable[[Environment, Environment | None], Arriving]
+    arriving: Callable[..., Arriving]
     camera: Camera
     pixels: Pixels
     ray: Float[Array, "h w 3"]
@@ -83,6 +86,7 @@ class PictureView(eqx.Module):
     keep: bool = eqx.field(static=True, default=False)
     shares: TexelShares | None = None
     lamp_rays: bool = eqx.field(static=True, default=False)
+    lamps: tuple[str, ...] = eqx.field(static=True, default=())
 
     @promoted
     def picture(
@@ -133,6 +137,46 @@ class PictureView(eqx.Module):
                 result.append(images["color"])
         return result
 
+    @promoted
+    def mix(
+        self, environment: Environment, *, regions: Mapping[str, Float[Array | np.ndarray, "6 n n"]] | None = None
+    ) -> dict[str, Float[Array, "h w c"]]:
+        """Layers of the picture by the light that they come from, with which a compositor mixes lights anew.
+
+        Layers are linear in their lights: to change the color or the strength of a light, multiply its layer.
+
+        Args:
+            environment: The light.
+            regions: Named parts of the environment: the share of each texel that belongs to the part, such as
+                `jaxprt.scene.environment.disk_share` makes it for a sun.
+
+        Returns:
+            A dictionary of pictures: one for each region and for each lamp of the scene, by their names, "rest" for the
+            rest of the environment, and "background" for what is seen of it. Their sum is `picture` exactly: the rest
+            is what the others leave of it.
+
+        Raises:
+            TypeError: `environment` is not an `Environment`, or `regions` is not a dictionary of arrays.
+            ValueError: A name is that of another layer, or the shares of a region are not [6, n, n] finite numbers from
+                0 to 1 as the environment has texels.
+        """
+        _check_light("the light", environment)
+        parts = _regions(environment, {} if regions is None else regions, (*self.lamps, "rest", "background"))
+        black = Environment(jnp.zeros_like(environment.radiance))
+        none, alone = np.zeros(len(self.lamps)), np.eye(len(self.lamps))
+        whole = self._light(environment, None)  # the first one, which rays are traced for
+        lights = {name: self._light(part, None, share=none) for name, part in parts.items()}
+        lights |= {name: self._light(black, None, share=share) for name, share in zip(self.lamps, alone, strict=True)}
+        lights["rest"] = whole
+        colors = self._colors(list(lights.values()), False, None)
+        result = {}
+        for number, name in enumerate(lights):
+            of_light = [(index, rows[number]) for index, rows in colors]
+            result[name] = self._image("color", of_light, environment, None)
+        result["rest"] = result["rest"] - sum(image for name, image in result.items() if name != "rest")
+        empty = canvas.sky(environment, self.camera, self.ray, self.pixels.background, colors=result["rest"].shape[-1])
+        return result | {"background": folded(empty, fold=self.fold)}
+
     def remembering(self, arriving: dict[tuple[int, bool], Arriving]) -> "PictureView":
         """The view with what other views of the scene computed of lights, by environment; these must stay in memory."""
 
@@ -144,12 +188,18 @@ class PictureView(eqx.Module):
 
         return dataclasses.replace(self, arriving=known_or_new)
 
-    def _light(self, environment: Environment, between: Between) -> "PictureLight":
-        """What arrives under an environment."""
-        traced = _traced_light(self, environment)
-        arriving = finished(self.arriving(environment, None if traced is None else traced.rest), between)
-        reflections = () if self.reflected is None else tuple(_reflections(self, environment, arriving, traced))
-        return PictureLight(arriving, traced, reflections)
+    def _light(
+        self, environment: Environment, between: Between, *, share: Float[np.ndarray, " n"] | None = None
+    ) -> "PictureLight":
+        """What arrives under an environment and a share of each lamp."""
+        traced, more = _traced_light(self, environment), () if share is None else (share,)
+        arriving = finished(self.arriving(environment, None if traced is None else traced.rest, *more), between)
+        reflections = ()
+        if self.reflected is not None:
+            # What rays hit is shaded with interpolated visibility, in the whole light.
+            whole = arriving if traced is None else self.arriving(environment, None, *more)
+            reflections = tuple(self.reflected.radiance(self.stage, whole))
+        return PictureLight(arriving, traced, reflections, share)
 
     def _colors(
         self, lights: Sequence["PictureLight"], apart: bool, between: Between
@@ -160,11 +210,19 @@ class PictureView(eqx.Module):
         traced, rows = 0, []
         for row in self.rows:
             sharp = row.number in self.stage.sharp_groups
-            of_row = [light.of_row(traced if sharp else None) for light in lights]
+            of_row = [light.of_row(traced if sharp else None, self._glow(row, light.share)) for light in lights]
             traced += sharp
             colors = _colors_of_row(self, row, of_row, lamps, apart=apart, recompute=recompute)
             rows.append((row.index, finished(colors, between)))
         return rows
+
+    def _glow(self, row: Row, share: Float[np.ndarray, " n"] | None) -> Float[Array, " p"] | None:
+        """Share of what each point of a row emits; None for all of it."""
+        if share is None:
+            return None
+        triangle = np.asarray(self.pixels.triangle)[np.maximum(row.index, 0)]
+        lamp = np.asarray(self.stage.lamp)[self.stage.part[self.stage.face[np.maximum(triangle, 0), 0]]]
+        return put(np.append(share, 0)[lamp].astype(self.ray.dtype))
 
     def _image(
         self, name: str, rows: Sequence[tuple[Any, tuple[Array, ...]]], light: Environment, behind: Environment | None
@@ -196,6 +254,27 @@ class PictureView(eqx.Module):
         return result
 
 
+class SceneLighting(eqx.Module):
+    """The light that arrives at a scene with given materials, as a function of the environment.
+
+    Direct light may be that of another environment, and lamps may have a share of their radiance.
+    """
+
+    scene: Any
+    materials: Any
+    appearances: dict[str, Appearance]
+
+    def __call__(
+        self, environment: Environment, direct: Environment | None = None, share: Float[np.ndarray, " n"] | None = None
+    ) -> Arriving:
+        """The arriving light."""
+        lights = split(self.scene.lamps, self.materials)[1]
+        light = self.scene.light(environment)
+        if direct is not None:
+            light = SceneLight(groups.direct(self.scene.surfaces, direct), light.transferred)
+        return self.scene.shade_lamps(light, {**self.appearances, **lights}, share)
+
+
 class RowLight(eqx.Module):
     """The light that arrives at the points of a row.
 
@@ -203,11 +282,13 @@ class RowLight(eqx.Module):
         arriving: The light that arrives at the scene, without what is taken out of traced texels.
         traced: The light with its traced texels; None without.
         reflections: What reflection rays add; None without.
+        glow: Share of what the points emit; None for all of it.
     """
 
     arriving: Arriving
     traced: TracedLight | None
     reflections: Float[Array, "p c"] | None
+    glow: Float[Array, " p"] | None
 
 
 class PictureLight(eqx.Module):
@@ -217,15 +298,17 @@ class PictureLight(eqx.Module):
         arriving: The light that arrives at the scene, without what is taken out of traced texels.
         traced: The light with its traced texels; None without.
         reflections: What reflection rays add, for each row of sharp groups.
+        share: Share of each lamp; None for all of it.
     """
 
     arriving: Arriving
     traced: TracedLight | None
     reflections: tuple[Float[Array, "_ c"], ...]
+    share: Float[np.ndarray, " n"] | None
 
-    def of_row(self, number: int | None) -> RowLight:
+    def of_row(self, number: int | None, glow: Float[Array, " p"] | None) -> RowLight:
         """The light of a row; `number` is its index among the rows of sharp groups, None for others."""
-        return RowLight(self.arriving, self.traced, None if number is None else self.reflections[number])
+        return RowLight(self.arriving, self.traced, None if number is None else self.reflections[number], glow)
 
 
 def _check_light(what: str, environment: Any) -> None:
@@ -233,6 +316,24 @@ def _check_light(what: str, environment: Any) -> None:
     require.colors(what, environment.radiance)
     if environment.radiance.ndim != 4:
         raise ValueError(f"a picture needs one light [6, n, n, c], got {list(environment.radiance.shape)}")
+
+
+def _regions(environment: Environment, regions: Any, taken: Sequence[str]) -> dict[str, Environment]:
+    """The named parts of an environment."""
+    require.kind("the regions", regions, Mapping, source="a dictionary from names to shares of texels")
+    shape, result = list(environment.radiance.shape[:3]), {}
+    for name, share in regions.items():
+        if not isinstance(name, str) or name in taken:
+            raise ValueError(f"a region must have a name other than {', '.join(taken)}, got {name!r}")
+        what = f"the share of the region {name!r}"
+        require.array(what, share, "6 n n")
+        if list(share.shape) != shape:
+            raise ValueError(f"{what} must have the {shape} texels of the light, got {list(share.shape)}")
+        require.finite(what, share)
+        if not (float(jnp.min(share)) >= 0 and float(jnp.max(share)) <= 1):
+            raise ValueError(f"{what} must be from 0 to 1, got {float(jnp.min(share)):g} to {float(jnp.max(share)):g}")
+        result[name] = Environment(environment.radiance * jnp.asarray(share, environment.radiance.dtype)[..., None])
+    return result
 
 
 def _check_background(background: Any) -> None:
@@ -249,15 +350,6 @@ def _traced_light(picture: PictureView, environment: Environment) -> TracedLight
     if picture.shadows == "vertices":
         return None
     return shadows.trace(picture.stage.whole, picture.pixels, picture.camera.width, environment, keep=picture.keep)
-
-
-def _reflections(
-    picture: PictureView, environment: Environment, arriving: Arriving, light: TracedLight | None
-) -> list[Float[Array, "_ c"]]:
-    """Traced reflections, of the whole light: what rays hit is shaded with interpolated visibility."""
-    assert picture.reflected is not None
-    whole = arriving if light is None else picture.arriving(environment, None)
-    return picture.reflected.radiance(picture.stage, whole)
 
 
 def _colors_of_row(
@@ -309,6 +401,8 @@ def _lit(
 ) -> tuple[Float[Array, "p c"], ...]:
     """Colors of points; if `apart`, also those without reflected light."""
     texels = None
+    if light.glow is not None and seen.emitted is not None:
+        seen = dataclasses.replace(seen, emitted=seen.emitted * light.glow[:, None])
     if light.traced is not None:
         texels = TexelLight(*light.traced.row(index), light.traced.rest.radiance.shape[-2], row.samples)
     direct, reflected, lamp = light.arriving.at(row.number)
@@ -346,10 +440,11 @@ def _points(picture: PictureView, index: Any) -> tuple[Points, Points]:
 
 def make(
     stage: Stage,
-    arriving: Callable[[Environment, Environment | None], Arriving],
+    arriving: Callable[..., Arriving],
     camera: Camera,
     *,
     samples: int,
+    lamps: tuple[str, ...],
     keep: bool,
     shadow: str | Environment,
     between: Between,
@@ -361,6 +456,7 @@ def make(
         arriving: Function from an environment to the light that arrives at the scene; see `PictureView`.
         camera: The camera, relative to the origin of the scene.
         samples: Number of coverage samples of each pixel: 1, 4 or 16.
+        lamps: Names of the lamps.
         keep: Whether to store what depends on the view, for many lights: about a kilobyte for each point.
         shadow: "rays" or "vertices", or the light whose brightest texels are traced for all lights.
         between: Function that is called between steps of the work, as in `RelitScene.picture`.
@@ -374,7 +470,7 @@ def make(
     with compile_time(stage.mesh, camera, stage.bend) if stage.sharp_groups else contextlib.nullcontext():
         pixels, rows = _placed(stage, camera, samples, between)
     rays = isinstance(shadow, Environment) or shadow == "rays"
-    lamps = lamplight.of(stage, pixels, camera.width) if rays else None
+    lit = lamplight.of(stage, pixels, camera.width) if rays else None
     complete, origins, sharp = [], [], stage.sharp_groups
     for row in rows:
         surface = sampled(stage.surfaces[row.number], row.samples)
@@ -382,7 +478,7 @@ def make(
         if stores or row.number in sharp:
             index = row.index if row.index.ndim == 1 else row.index[0]
             points, on_group = canvas.points_of(pixels, stage.face, stage.shift, index)
-            transport = None if lamps is None else lamps.row(row.number, index, on_group)
+            transport = None if lit is None else lit.row(row.number, index, on_group)
             if stores:
                 seen = _seen(stage, surface, row.number, points, on_group, camera, lamps=transport)
                 row = dataclasses.replace(row, viewed=seen)
@@ -399,7 +495,8 @@ def make(
         shares = None if traced is None else put(traced.shares)
     else:
         way = shadow
-    return PictureView(stage, arriving, camera, pixels, ray, tuple(complete), reflected, fold, way, keep, shares, rays)
+    more = {"shares": shares, "lamp_rays": rays, "lamps": lamps}
+    return PictureView(stage, arriving, camera, pixels, ray, tuple(complete), reflected, fold, way, keep, **more)
 
 
 def drawn(camera: Camera, samples: int) -> tuple[int, Camera, int]:

@@ -212,6 +212,12 @@ class RelitScene(System):
     @promoted
     def shade(self, light: SceneLight, materials: Mapping[str, Any] | None = None) -> Arriving:
         """The light that arrives at all groups, given the materials. Redone when the light or the materials change."""
+        return self.shade_lamps(light, materials)
+
+    def shade_lamps(
+        self, light: SceneLight, materials: Mapping[str, Any] | None, share: Float[np.ndarray, " n"] | None = None
+    ) -> Arriving:
+        """`shade` with a share of the radiance of each lamp; all of it if None."""
         require.kind("the light", light, SceneLight, source="RelitScene.light")
         of_parts, changed = scene_lamps.split(self.lamps, materials)
         appearances = self.appearances(of_parts)
@@ -222,6 +228,7 @@ class RelitScene(System):
             pairs = zip(self.surfaces, direct, strict=True)
             direct = tuple(surface.system.tilted(lit, surface.frame[:, 2]) for surface, lit in pairs)
         lamp = None if self.lamps is None else self.lamps.radiance(self._all(appearances), changed)
+        lamp = lamp if lamp is None or share is None else lamp * share[:, None].astype(lamp.dtype)
         reflected = None if self.bounces is None else self.bounces.shade(light.transferred, blends, lamp)
         return Arriving(direct, reflected, lamp)
 
@@ -656,8 +663,9 @@ class RelitScene(System):
         of_parts = scene_lamps.split(self.lamps, materials)[0]
         appearances = self.appearances(of_parts)
         stage = self._stage(of_parts, appearances)
-        arriving = _Lit(self, materials, appearances)
-        return pictures.make(stage, arriving, camera.local(self.mesh.origin), **options)
+        arriving = pictures.SceneLighting(self, materials, appearances)
+        names = () if self.lamps is None else self.lamps.names(self.scene.names)
+        return pictures.make(stage, arriving, camera.local(self.mesh.origin), lamps=names, **options)
 
     def with_rays(self, rays: int) -> "RelitScene":
         """The scene with another number of reflection rays for its sharp parts; 0 reflects by harmonics alone."""
@@ -780,21 +788,3 @@ class RelitScene(System):
         """The appearance of each part: the given one, or that of the material it was precomputed with."""
         pairs = zip(self.scene.parts, self.shading, strict=True)
         return [appearances.get(part.name) or channels.precomputed(shading) for part, shading in pairs]
-
-
-class _Lit(eqx.Module):
-    """The light that arrives at a scene with given materials, as a function of the environment.
-
-    Direct light may be that of another environment.
-    """
-
-    scene: RelitScene
-    materials: Any
-    appearances: dict[str, Appearance]
-
-    def __call__(self, environment: Environment, direct: Environment | None = None) -> Arriving:
-        lights = scene_lamps.split(self.scene.lamps, self.materials)[1]
-        light = self.scene.light(environment)
-        if direct is not None:
-            light = SceneLight(groups.direct(self.scene.surfaces, direct), light.transferred)
-        return self.scene.shade(light, {**self.appearances, **lights})

@@ -486,6 +486,21 @@ def add_disk(light: Environment, direction: ArrayLike, *, angle: float, radiance
     return _with_panorama(put(total.astype(light.radiance.dtype)), pixels)
 
 
+def disk_share(direction: ArrayLike | Sequence[float], *, angle: float, size: int) -> Float[np.ndarray, "6 n n"]:
+    """Share of each texel of a light that lies in a disk, such as that of a sun with the glow around it.
+
+    Args:
+        direction: Direction towards the center of the disk, in world coordinates.
+        angle: Its angular radius in radians.
+        size: Texels along the edge of the light's faces.
+
+    Raises:
+        ValueError: The direction is zero, or the angle is not between 1e-4 and pi.
+    """
+    way = np.asarray(_toward(direction), float)
+    return np.clip(panorama.disk_texels(way, _angle(angle), size), 0, 1)
+
+
 def _direction(value: Any) -> Array:
     require.finite("direction", value)
     direction = require.floating(value)

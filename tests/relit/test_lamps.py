@@ -89,6 +89,40 @@ def test_pictures_have_the_light_of_lamps(close):
     assert np.linalg.norm(np.asarray(lamp) - picture) > 0.05 * np.linalg.norm(picture)
 
 
+def test_layers_by_light_are_pictures_of_their_light_alone_and_add_up(close):
+    around = Environment(jnp.asarray(np.random.default_rng(0).uniform(size=(6, 8, 8, 3)).astype(np.float32)))
+    right = (np.asarray(cubemap.direction(size=8))[..., 0] > 0).astype(np.float32)
+    traced = relit().picture_view()
+    close(sum(traced.mix(around, regions={"right": right}).values()), traced.picture(around))
+    layers = relit().picture_view(shadows="vertices").mix(around, regions={"right": right})
+    assert list(layers) == ["right", "panel", "bulb", "rest", "background"]
+    off = {"panel": TexturedMaterial(**BLACK), "bulb": PointLight("bulb", BULB.position, 0.0)}
+    alone = {
+        "right": (Environment(around.radiance * right[..., None]), off),
+        "panel": (DARK, {"bulb": off["bulb"]}),
+        "bulb": (DARK, {"panel": off["panel"]}),
+        "rest": (Environment(around.radiance * (1 - right[..., None])), off),
+    }
+    for name, (light, materials) in alone.items():
+        picture = relit().picture(light, materials=materials, background=None, shadows="vertices")
+        close(layers[name], picture[..., :3], tolerance=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("regions", "words"),
+    [
+        ({"panel": np.ones((6, 8, 8))}, "other than panel, bulb, rest, background"),
+        ({"sun": np.ones((6, 4, 4))}, "must have the"),
+        ({"sun": np.full((6, 8, 8), 2.0)}, "must be from 0 to 1, got 2 to 2"),
+        ({"sun": np.full((6, 8, 8), np.nan)}, "finite"),
+    ],
+    ids=["name", "size", "range", "nan"],
+)
+def test_regions_that_are_none_are_refused(regions, words):
+    with pytest.raises(ValueError, match=words):
+        relit().picture_view().mix(DARK, regions=regions)
+
+
 def test_pictures_have_the_derivatives_of_their_lamps():
     """By the light of the panel and by the color of the floor; a picture is linear in the first."""
 

@@ -559,3 +559,24 @@ def test_wrong_suns_are_refused(make, message):
 def test_what_is_no_sun_is_refused():
     with pytest.raises(TypeError, match="suns must be a list of suns"):
         with_suns(Environment(np.ones((6, 2, 2, 3))), SUNS[0])
+
+
+@pytest.mark.parametrize("angle", [0.05, 0.6])
+def test_the_share_of_a_disk_has_its_solid_angle_around_its_direction(angle):
+    share = environment.disk_share([2.0, 1.0, -0.5], angle=angle, size=16)
+    area = share * np.asarray(cubemap.solid_angle(size=16))
+    np.testing.assert_allclose(area.sum(), 2 * np.pi * (1 - np.cos(angle)), rtol=0.02)
+    center = np.einsum("fij,fijc->c", area, np.asarray(cubemap.direction(size=16)))
+    toward = np.array([2.0, 1.0, -0.5]) / np.linalg.norm([2.0, 1.0, -0.5])
+    assert center @ toward / np.linalg.norm(center) > 0.998
+    assert share.max() <= 1
+
+
+def test_lights_of_another_size_have_the_same_flux():
+    light = Environment(jnp.asarray(np.random.default_rng(0).uniform(size=(6, 8, 8, 3)), jnp.float32))
+    for size in (2, 8, 32):
+        area = cubemap.solid_angle(size=size)[..., None]
+        flux = jnp.sum(environment.resized(light, size=size).radiance * area)
+        np.testing.assert_allclose(flux, jnp.sum(light.radiance * cubemap.solid_angle(size=8)[..., None]), rtol=0.03)
+    with pytest.raises(ValueError, match="must divide 12 or be a multiple"):
+        environment.resized(light, size=12)
