@@ -281,6 +281,10 @@ class Exported(eqx.Module):
         """The same at lower resolution: from a scale of the visibility on, and matrices up to a degree."""
         return self
 
+    def means_by_bits(self) -> "Exported":
+        """The same where the page has the bits of texels too, of which it can make means of visibility."""
+        return self
+
     def relit(self) -> System:
         """The system that computes what the page does, from `vector` and `visible` as they are."""
         vector = jnp.asarray(self.vector, jnp.result_type(float))[:, None]

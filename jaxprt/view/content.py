@@ -38,7 +38,7 @@ def page_content(page: PageScene, lights: Sequence[Environment]) -> tuple[dict[s
     content, arrays = scene_content(page)
     mips, size = mip_edges(lights[0].radiance.shape[-2]), page.light_size
     blurring = blur_parameters(size) if size else NO_SCALES
-    rims = sorted({mips[0], *blurring["edges"]}, reverse=True)
+    rims = sorted({mips[0], *blurring["edges"], *content["edges"]}, reverse=True)
     content |= {"light": blurring, "mips": mips, "rims": rims, "lights": len(lights), "glossy": bool(size)}
     arrays += [cubemap.border_index(size=edge).astype("<u4").tobytes() for edge in rims]
     return content, arrays + [light_texels(light, mips[0]) for light in lights]
@@ -66,7 +66,8 @@ def scene_content(page: PageScene) -> tuple[dict[str, Any], list[bytes]]:
     terms = max(-(-len(unit) // 4) * 4, 4)
     place: dict[str, int] = dict.fromkeys(_STARTS, 0)
     tables, normals = _Tables(), _normals(page)
-    parts, stride = [], 0
+    parts, scale = [], page.scales
+    stride = 0 if scale is None else int(scale.total - scale.start[page.level])
     arrays: list[list[np.ndarray]] = [[] for _ in range(6)]
     rows = zip(page.scene.parts, page.shading, page.parts, bits, normals, strict=True)
     for part, shading, held, bit, direction in rows:
@@ -79,18 +80,19 @@ def scene_content(page: PageScene) -> tuple[dict[str, Any], list[bytes]]:
         about |= {"weightStep": 0 if described else weight.shape[1], **(described or {})}
         parts.append(about | place | {"tableStart": start})
         weight = weight[:1] if described else weight
-        stride = max(stride, seen.shape[1])
         vector = _bytes(held.vector, unit, terms)
         visible = _bytes(held.visible, visible_unit, 4 * about["words"])
         normal = np.round(32767 * np.asarray(direction))
         kinds = "<i2", "i1", "u1", "<f4", "i1", "u1"
-        for column, array, kind in zip(arrays, (normal, vector, seen, weight, visible, bit), kinds, strict=True):
+        for column, array, kind in zip(arrays, (normal, vector, seen, weight, visible, bit.T), kinds, strict=True):
             column.append(array.astype(kind).reshape(-1))
+        means = 0 if held.scales is None else count * stride
         pairs = count * -(-(about["bands"] ** 2) // 2)
-        sizes = count, weight.size // 4, seen.size, visible.size // 4, pairs, bit.size
+        sizes = count, weight.size // 4, means, visible.size // 4, pairs, bit.size
         place = {name: start + size for (name, start), size in zip(place.items(), sizes, strict=True)}
     content = {"parts": parts, "terms": terms, "vectorUnit": unit.tolist(), "stride": stride, **_scales(page)}
     content |= {"visibleUnit": visible_unit.tolist(), "arrived": place["arrivedStart"]}
+    content |= {"means": place["pyramidStart"]}
     edge = page.texel_edge
     content |= {"texelEdge": edge, "texels": texels_of(edge) if edge else 0, "visibility": not page.unshadowed}
     joined = [np.concatenate(column) for column in arrays]

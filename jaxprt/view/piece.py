@@ -2,12 +2,11 @@
 
 import base64
 import html
-import itertools
 import os
 import pathlib
 import warnings
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from jaxprt import require
@@ -18,11 +17,12 @@ from jaxprt.view import browser, messages, page_error
 from jaxprt.view.content import page_content
 from jaxprt.view.messages import Reply
 from jaxprt.view.page_error import Cause
-from jaxprt.view.reduced import FIRST, MOST_BYTES, PageScene
+from jaxprt.view.reduced import FIRST, PageScene
 from jaxprt.view.session import Session
 
 _SKY_ROWS, _LEAST_SKY_ROWS = 1024, 128  # most rows of a picture of a light; at 128 texels are as good
 _SPARE_OF_SKIES = 4096  # bytes for what the page says of them
+_EFFORT = 9  # level of the compression of files that are written; sizes are tried with less
 _SPARE = 64  # bytes by which the page's size may change when another error is written into it
 _SMOOTHEST = 0.25  # least roughness that users of a page can choose: smoother materials vary over a bright texel
 _PAGE = """<!doctype html>
@@ -116,9 +116,8 @@ def export(
     lights = dict(zip(session.stages.name, session.stages.lights, strict=True))
     whole = PageScene.of(scene)
     # Sharp shadows of a small sun matter more than finely averaged visibility.
-    fits = whole.bits is not None and sum(words.size for words in whole.bits) <= MOST_BYTES
     least = 0
-    for texels, size in itertools.product([True, False] if fits else [False], _sizes(whole)):
+    for texels, size in _sizes(whole):
         reduced = whole.reduced(size.level, texels=texels, degree=size.degree)
         contents = page_content(reduced, list(lights.values()))
         least = len(_page(session, reduced, lights, contents, error=0.0, title=path.stem))
@@ -131,11 +130,10 @@ def export(
         least = len(page)
         if least <= most:
             skies = _skies(session, most - least - _SPARE_OF_SKIES)
-            if any(sky is not None for sky in skies):
-                page = _page(session, reduced, lights, contents, skies, error=measured.error, title=path.stem)
-                least = len(page)
+            options = {"error": measured.error, "title": path.stem, "effort": _EFFORT}
+            page = _page(session, reduced, lights, contents, skies, **options)
             outputs.write(path, page)
-            return Piece(path, least, size.edge, texels, size.degree, *measured)
+            return Piece(path, len(page), size.edge, texels, size.degree, *measured)
     raise ValueError(
         f"most must be at least about {least} bytes, the size of the page with the coarsest visibility, got {most}"
     )
@@ -149,27 +147,33 @@ class _Size(NamedTuple):
     degree: int | None
 
 
-def _sizes(page: PageScene) -> list[_Size]:
-    """Resolutions from the finest to the coarsest. The data that takes more bytes is reduced first."""
+def _sizes(page: PageScene) -> Iterator[tuple[bool, _Size]]:
+    """Whether a page has the visibility of single texels, and its resolution, from the finest to the coarsest.
+
+    The data that takes more bytes is reduced first. With the visibility of single texels, the page makes averaged
+    visibility from it, which then takes no bytes.
+    """
     scale, counts = page.scales, [held.vector.shape[1] for held in page.parts]
     lobes = sum(count for count, held in zip(counts, page.parts, strict=True) if held.scales is not None)
     matrices = [(count, held.degree) for count, held in zip(counts, page.parts, strict=True) if held.degree is not None]
-    degree = max((most for _, most in matrices), default=None)
-    level = 0 if scale is None else FIRST
-    result = []
-    while True:
-        result.append(_Size(level, 0 if scale is None else int(scale.edge[level]), degree))
-        means = 0 if scale is None or level == len(scale.edge) - 1 else lobes * int(scale.total - scale.start[level])
-        bands = 0
-        if degree is not None and degree > 1:
-            bands = sum(count * (2 * min(most, degree) + 1) ** 2 for count, most in matrices)
-        if not means and not bands:
-            return result
-        if means >= bands:
-            level += 1
-        else:
-            assert degree is not None
-            degree -= 1
+    for texels in [True, False] if page.holds_texels else [False]:
+        degree = max((most for _, most in matrices), default=None)
+        level = 0 if scale is None else FIRST
+        while True:
+            yield texels, _Size(level, 0 if scale is None else int(scale.edge[level]), degree)
+            means = 0
+            if scale is not None and not texels and level < len(scale.edge) - 1:
+                means = lobes * int(scale.total - scale.start[level])
+            bands = 0
+            if degree is not None and degree > 1:
+                bands = sum(count * (2 * min(most, degree) + 1) ** 2 for count, most in matrices)
+            if not means and not bands:
+                break
+            if means >= bands:
+                level += 1
+            else:
+                assert degree is not None
+                degree -= 1
 
 
 def _page(
@@ -181,8 +185,9 @@ def _page(
     *,
     error: float,
     title: str,
+    effort: int = 6,
 ) -> bytes:
-    """The content of the HTML file."""
+    """The content of the HTML file. `effort` is the level of its compression, from 1 to 9."""
     reply = session.answer({"kind": "scene"})
     content, arrays = contents
     free = [
@@ -202,7 +207,7 @@ def _page(
         *arrays,
         *(buffer for sky in skies if sky is not None for buffer in sky.buffers),
     ]
-    data = base64.b64encode(zlib.compress(messages.pack(content, buffers), 6)).decode()
+    data = base64.b64encode(zlib.compress(messages.pack(content, buffers), effort)).decode()
     module = "data:text/javascript;base64," + base64.b64encode(browser.module().encode()).decode()
     return _PAGE.format(title=html.escape(title), data=data, module=module).encode()
 

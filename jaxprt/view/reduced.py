@@ -111,7 +111,7 @@ class PageScene:
         count = sum(part.vector.shape[1] for part in page.parts if part.scales is not None)
         while count * int(scale.total - scale.start[level]) > MOST_BYTES and level < len(scale.edge) - 1:
             level += 1
-        fits = page.bits is not None and sum(words.size for words in page.bits) <= MOST_BYTES
+        fits = page.holds_texels
         return page.reduced(level, texels=fits)
 
     def reduced(self, level: int, *, texels: bool, degree: int | None = None) -> "PageScene":
@@ -123,6 +123,8 @@ class PageScene:
             degree: Highest degree of the transfer matrices; None keeps their degree.
         """
         parts = [part.reduced(level, degree) for part in self.parts]
+        if texels:
+            parts = [part.means_by_bits() for part in parts]
         vectors, visible = ([getattr(part, name) for part in parts] for name in ("vector", "visible"))
         rounded = zip(parts, _rounded(vectors), _rounded(visible), strict=True)
         parts = [dataclasses.replace(part, vector=vector, visible=seen) for part, vector, seen in rounded]
@@ -145,6 +147,11 @@ class PageScene:
         if self.texels is None:
             return None
         return [np.zeros((0, 0), np.uint8) if seen is None else seen.packed for seen in self.texels]
+
+    @property
+    def holds_texels(self) -> bool:
+        """Whether graphics cards hold the visibility of single texels."""
+        return self.bits is not None and sum(words.size for words in self.bits) <= MOST_BYTES
 
     @property
     def texel_edge(self) -> int:

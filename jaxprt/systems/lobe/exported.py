@@ -43,9 +43,11 @@ class ExportedLobes(Exported):
 
     Attributes:
         level: Finest scale of the visibility that the page holds.
+        by_bits: Whether the page makes the means of visibility from the bits of texels, which it holds too.
     """
 
     level: int = eqx.field(static=True, default=0)
+    by_bits: bool = eqx.field(static=True, default=False)
 
     @property
     def brdf(self) -> LobeBrdf:
@@ -69,7 +71,9 @@ class ExportedLobes(Exported):
 
     @property
     def means(self) -> UInt8[np.ndarray, "v n"]:
-        """Mean visibility from the finest scale on."""
+        """Mean visibility from the finest scale on; nothing where the page makes it from bits."""
+        if self.by_bits:
+            return np.zeros((0, 0), np.uint8)
         return np.ascontiguousarray(np.asarray(self.system.transport.pyramid)[:, self.scales.start[self.level] :])
 
     @property
@@ -99,9 +103,14 @@ class ExportedLobes(Exported):
         """The same with visibility from a scale on."""
         return dataclasses.replace(self, level=level)
 
+    def means_by_bits(self) -> "ExportedLobes":
+        """The same with means of visibility that the page makes from the bits of texels."""
+        return dataclasses.replace(self, by_bits=True)
+
     def relit(self) -> System:
         """The lobes with the remaining visibility, under a light of fewer texels."""
         old, spread = self.system.transport, float(self.scales.spread[self.level])
+        old = pyramid.from_bits(old) if self.by_bits else old
         vector = jnp.asarray(self.vector, jnp.result_type(float))
         places = old.position, old.frame, self.light_size
         return self.system.coarse(CoarseTransport(old.pyramid, vector, *places, old.size, spread))

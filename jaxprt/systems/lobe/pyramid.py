@@ -4,6 +4,7 @@ A pyramid stores the visibility of cubemap texels as one bit each, and means ove
 visibility of a lobe is read from a few texels at the scale of its width. Pyramids do not depend on the BRDF.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial, reduce
@@ -372,6 +373,19 @@ def bits(transport: LobeTransport) -> LobeTransport:
     """The transport with only the bits, about half of its bytes: enough for the visibility of single texels."""
     finest = transport.pyramid[:, : 6 * transport.size**2 // 8]
     return LobeTransport(finest, transport.vector[:0], transport.position, transport.frame, transport.size)
+
+
+def from_bits(transport: LobeTransport) -> LobeTransport:
+    """The transport with the means of its bits in place of the means of finer visibility."""
+    scale, rows = scales(transport.size), []
+    for first in range(0, len(transport.position), _BLOCK):
+        byte = np.asarray(transport.packed[first : first + _BLOCK])
+        half = transport.size // 2
+        bit = np.unpackbits(byte, axis=1, bitorder="little").reshape(len(byte), 6, half, half // 2, 2, 2, 2)
+        seen = bit.transpose(0, 1, 2, 5, 3, 4, 6).reshape(len(byte), -1) * np.uint8(visibility.LEVELS)
+        rows.append(np.asarray(pyramid(jnp.asarray(seen))))
+    levels = np.concatenate(rows) if rows else np.zeros((0, scale.total), np.uint8)
+    return dataclasses.replace(transport, pyramid=jax.device_put(levels))
 
 
 class TexelBits(eqx.Module):

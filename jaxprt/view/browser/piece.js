@@ -24,6 +24,7 @@ export class Piece {
     this.index = new Map(content.rims.map((edge) => [edge, next(Uint32Array)]));
     this.lights = Array.from({ length: content.lights }, () => next(Float32Array));
     this.count = this.position.length / 3;
+    if (content.means > this.pyramid.length) this.pyramid = means(content, this.bits, this.index);
   }
   build(gl) { // in a context, whose first texture unit stays free
     const { content } = this;
@@ -330,6 +331,45 @@ export class Piece {
     part.written = key;
   }
 }
+
+// Means of visibility at all scales, from the bits of texels: see `pyramid` in jaxprt/systems/lobe/pyramid.py. A byte has
+// two rows of four texels, and the bytes of all vertices of a part stand together.
+function means(content, bits, index) {
+  const { texelEdge: size, edges, stride } = content, result = new Uint8Array(4 * Math.ceil((content.means + 1) / 4));
+  const { area } = grid(size), across = size / 4, whole = [], table = new Float32Array(256 * (size / 2) * across);
+  for (let edge = across; edge >= 1; edge /= 2) whole.push({ edge, area: grid(edge).area, value: new Float32Array(6 * edge * edge) });
+  for (let byte = 0; byte < (size / 2) * across; byte++) for (let bit = 0; bit < 8; bit++) {
+    const row = 2 * Math.floor(byte / across) + ((bit >> 1) & 1), column = 4 * (byte % across) + 2 * (bit >> 2) + (bit & 1);
+    const share = area[row * size + column] / whole[0].area[(row >> 2) * across + (column >> 2)];
+    for (let value = 0; value < 256; value++) if ((value >> bit) & 1) table[256 * byte + value] += share;
+  }
+  for (const part of content.parts) for (let vertex = 0; part.lobes && vertex < part.count; vertex++) {
+    const { value: finest } = whole[0];
+    for (let face = 0, to = 0, byte = 0; face < 6; face++) for (let row = 0; row < across; row++, byte += across) for (let column = 0; column < across; column++, to++, byte++) {
+      const on = byte - face * (size / 2) * across, from = part.bitStart + byte * part.count + vertex;
+      finest[to] = table[256 * on + bits[from]] + table[256 * (on + across) + bits[from + across * part.count]];
+    }
+    for (let level = 1; level < whole.length; level++) {
+      const { edge, area: large, value } = whole[level], { area: small, value: fine } = whole[level - 1];
+      for (let row = 0, to = 0; row < 6 * edge; row++) for (let column = 0; column < edge; column++, to++) {
+        const a = 4 * row * edge + 2 * column, b = a + 2 * edge;
+        value[to] = (fine[a] * small[a] + fine[a + 1] * small[a + 1] + fine[b] * small[b] + fine[b + 1] * small[b + 1]) / large[to];
+      }
+    }
+    edges.forEach((edge, level) => {
+      const { value } = whole.find((each) => each.edge === edge), from = index.get(edge), m = edge + 2;
+      const to = part.pyramidStart + vertex * stride + content.starts[level];
+      for (let i = 0; i < 6 * m * m; i++) result[to + i] = 255 * value[from[i]] + 0.5;
+      for (let face = 0; face < 6; face++) for (let k = 0; k < 4; k++) {
+        const [row, column] = [k >> 1 ? m - 1 : 0, k & 1 ? m - 1 : 0], [up, left] = [row ? row - 1 : 1, column ? column - 1 : 1];
+        const at = (y, x) => value[from[(face * m + y) * m + x]];
+        result[to + (face * m + row) * m + column] = (255 * (at(up, left) + at(up, column) + at(row, left))) / 3 + 0.5;
+      }
+    });
+  }
+  return result;
+}
+
 function placeOf(gl, program, name) {
   const known = (program.places ??= new Map());
   if (!known.has(name)) known.set(name, gl.getUniformLocation(program, name));

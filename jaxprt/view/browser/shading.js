@@ -346,7 +346,7 @@ ${AT} ${CUBE} ${BRIGHT}
 float bit(int vertex, int face, int row, int column) {
   row = clamp(row, 0, TEXELS - 1);
   column = clamp(column, 0, TEXELS - 1);
-  int address = bitStart + vertex * (6 * TEXELS * TEXELS / 8) + (face * (TEXELS / 2) + row / 2) * (TEXELS / 4) + column / 4;
+  int address = bitStart + ((face * (TEXELS / 2) + row / 2) * (TEXELS / 4) + column / 4) * count + vertex;
   uint word = texelFetch(bits, at(address >> 2), 0).r;
   return float((word >> uint(8 * (address & 3) + (column / 2 & 1) * 4 + (row & 1) * 2 + (column & 1))) & 1u);
 }
