@@ -1,5 +1,6 @@
 """Makes pictures/viewer.gif: plays the viewer in headless Chromium, `python docs/make_viewer.py`.
 
+Each frame is shown as long as the viewer took for it, from the gesture to the picture, on the machine that ran it.
 Needs the extra `test`, for playwright, and Chromium as `chromium`. Takes some minutes on two cores.
 """
 
@@ -8,7 +9,10 @@ import math
 import pathlib
 import shutil
 import tempfile
+import time
+from collections.abc import Sequence
 
+import numpy as np
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
@@ -16,84 +20,114 @@ import jaxprt as prt
 from jaxprt.scene import builtin
 
 PICTURE = pathlib.Path(__file__).parents[1] / "pictures" / "viewer.gif"
-SIZE = (480, 300)
-SHOWN = (768, 480)  # the page, which is drawn larger and then reduced
-MOST_BYTES = 1_500_000
-MILLISECONDS = 110  # of a frame
-COLORS = 96
+SIZE = (640, 400)
+SHOWN = (960, 600)  # the page, which is drawn larger and then reduced
+MOST_BYTES = 2_500_000
+LEAST, RESTING = 40, 1200  # milliseconds of a frame, and of a picture at rest
+COLORS = 128
 _SWITCHES = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 _ROOT = "document.querySelector('#viewer').shadowRoot"
 
 
 def relit(folder: str) -> prt.RelitScene:
-    """Chess pieces of red plastic on a board, by eight lobes."""
+    """Chess pieces of metal on a board, and a floor below, by eight lobes."""
     pieces, light, dark = prt.scene.mesh.split(builtin.chess())
-    plastic = prt.scene.TexturedMaterial(base_color=(0.4, 0.1, 0.08), metallic=0.0, roughness=0.4)
-    squares = [
-        prt.scene.TexturedMaterial(base_color=color, metallic=0.0, specular=0.0)
-        for color in ((0.6, 0.55, 0.45), (0.12, 0.08, 0.06))
-    ]
-    parts = zip(("pieces", "light squares", "dark squares"), (pieces, light, dark), (plastic, *squares), strict=True)
-    scene = prt.Scene([prt.Part(*each) for each in parts])
-    return prt.precompute(scene, system=prt.relit.Lobes(8), path=folder)
+    metal = prt.scene.TexturedMaterial(base_color=(0.9, 0.62, 0.3), metallic=1.0, roughness=0.3)
+    colors = {"light squares": (0.6, 0.55, 0.45), "dark squares": (0.12, 0.08, 0.06), "floor": (0.35, 0.37, 0.4)}
+    matte = {
+        name: prt.scene.TexturedMaterial(base_color=color, metallic=0.0, specular=0.0) for name, color in colors.items()
+    }
+    square = builtin.plane(cells=24)
+    floor = prt.scene.mesh.make_mesh(8 * np.asarray(square.position) - [0, 0.26, 0], square.face)
+    meshes = {"light squares": light, "dark squares": dark, "floor": floor}
+    parts = [prt.Part("pieces", pieces, metal), *(prt.Part(name, mesh, matte[name]) for name, mesh in meshes.items())]
+    camera = prt.Camera([5.2, 4.4, 7.0], [0.0, 0.3, 0.0], [0.0, 1.0, 0.0], 0.6, *SIZE)
+    return prt.precompute(prt.Scene(parts, cameras=[camera]), system=prt.relit.Lobes(8), path=folder)
 
 
-def settle(page: Page, *, rest: bool = False) -> None:
-    """Waits until the newest look is shown, or the picture at rest as well."""
-    stats, more = f"{_ROOT}.querySelector('.canvas')?.stats", "&& s.stills > 0" if rest else ""
-    page.wait_for_function(f"() => {{ const s = {stats}; return s && s.shown >= 0 && s.shown === s.seq {more}; }}")
+class Film:
+    """Frames of a page, with the milliseconds for which each is shown."""
 
+    def __init__(self, page: Page):
+        """Starts with no frames."""
+        self.page, self.frames, self.milliseconds = page, [], []
 
-def frame(page: Page) -> Image.Image:
-    """What the page shows."""
-    return Image.open(io.BytesIO(page.screenshot())).convert("RGB").resize(SIZE, Image.Resampling.LANCZOS)
+    def settle(self) -> None:
+        """Waits until the newest look is shown."""
+        stats = f"{_ROOT}.querySelector('.canvas')?.stats"
+        shown = f"() => {{ const s = {stats}; return s && s.shown >= 0 && s.shown === s.seq; }}"
+        self.page.wait_for_function(shown, polling="raf")
 
+    def take(self, milliseconds: float) -> None:
+        """Adds what the page shows."""
+        shown = Image.open(io.BytesIO(self.page.screenshot())).convert("RGB")
+        self.frames.append(shown.resize(SIZE, Image.Resampling.LANCZOS))
+        self.milliseconds.append(milliseconds)
 
-def play(page: Page) -> list[Image.Image]:
-    """Orbits, turns the light, and drags a material through roughness and reflectance: 36 frames."""
-    frames = []
-    settle(page, rest=True)
-    page.evaluate(f"() => {{ {_ROOT}.querySelector('.line').style.visibility = 'hidden'; }}")
-    middle = (SHOWN[0] * 0.35, SHOWN[1] * 0.55)
+    def rest(self) -> None:
+        """Adds the picture at rest, once it has come."""
+        self.page.wait_for_timeout(4000)
+        self.take(RESTING)
 
-    def drag(start, places) -> None:
-        page.mouse.move(*start)
-        page.mouse.down()
+    def drag(self, start: tuple[float, float], places: Sequence[tuple[float, float]]) -> None:
+        """Adds a frame for each place of a drag."""
+        self.page.mouse.move(*start)
+        self.page.mouse.down()
         for place in places:
-            page.mouse.move(*place)
-            settle(page)
-            frames.append(frame(page))
-        page.mouse.up()
-        settle(page)
+            began = time.perf_counter()
+            self.page.mouse.move(*place)
+            self.settle()
+            self.page.evaluate(
+                "() => new Promise((drawn) => requestAnimationFrame(() => requestAnimationFrame(drawn)))"
+            )
+            self.take(max(1000 * (time.perf_counter() - began), LEAST))
+        self.page.mouse.up()
+        self.settle()
 
-    drag(middle, [(middle[0] + 9 * k, middle[1] + 30 * math.sin(k / 4)) for k in range(1, 13)])
-    page.keyboard.down("Shift")
-    drag(middle, [(middle[0] + 24 * k, middle[1]) for k in range(1, 13)])
-    page.keyboard.up("Shift")
+
+def play(page: Page) -> Film:
+    """Orbits, turns the light by its slider, and drags the metal to a plastic and through roughness and reflectance."""
+    film = Film(page)
+    film.settle()
+    page.get_by_text("View", exact=True).click()  # folds what the film does not use
+    film.take(RESTING)
+    middle = (SHOWN[0] * 0.35, SHOWN[1] * 0.55)
+    film.drag(middle, [(middle[0] + 9 * k, middle[1] + 30 * math.sin(k / 4)) for k in range(1, 11)])
+    film.rest()
+
+    def slide(name: str, start: float, end: float, steps: int) -> None:
+        slider = page.get_by_label(name, exact=True).first
+        slider.scroll_into_view_if_needed()
+        box = slider.bounding_box()
+        assert box is not None
+        across = [box["x"] + 8 + (box["width"] - 16) * (start + (end - start) * k / steps) for k in range(steps + 1)]
+        film.drag((across[0], box["y"] + box["height"] / 2), [(x, box["y"] + box["height"] / 2) for x in across[1:]])
+
+    slide("rotation °", 0.5, 0.85, 10)
+    film.rest()
+    slide("roughness", 0.3, 0.6, 5)
+    slide("metallic", 1.0, 0.0, 6)
     plane = page.locator("canvas.plane").first
     plane.scroll_into_view_if_needed()
     box = plane.bounding_box()
     assert box is not None
-
-    def place(x: float, y: float) -> tuple[float, float]:
-        return box["x"] + x * box["width"], box["y"] + (1 - y) * box["height"]
-
-    path = [(0.3 + 0.6 * k / 4, 0.25) for k in range(5)] + [
-        (0.9 - 0.8 * k / 7, 0.25 + 0.65 * k / 7) for k in range(1, 8)
-    ]
-    drag(place(*path[0]), [place(*each) for each in path])
-    return frames
+    path = [(0.6 - 0.45 * k / 8, 0.2 + 0.35 * k / 8) for k in range(9)]
+    places = [(box["x"] + x * box["width"], box["y"] + (1 - y) * box["height"]) for x, y in path]
+    film.drag(places[0], places[1:])
+    film.rest()
+    return film
 
 
-def write(frames: list[Image.Image]) -> int:
+def write(frames: list[Image.Image], milliseconds: list[float]) -> int:
     """Writes the frames with one palette for all; the number of bytes."""
     sheet = Image.new("RGB", (SIZE[0], SIZE[1] * 3))
     for row, number in enumerate((0, len(frames) // 2, len(frames) - 1)):
         sheet.paste(frames[number], (0, row * SIZE[1]))
     palette = sheet.quantize(COLORS)
     reduced = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in frames]
+    lasting = [10 * round(each / 10) for each in milliseconds]  # the unit of the format is 10 ms
     reduced[0].save(
-        PICTURE, save_all=True, append_images=reduced[1:], duration=MILLISECONDS, loop=0, optimize=True, disposal=1
+        PICTURE, save_all=True, append_images=reduced[1:], duration=lasting, loop=0, optimize=True, disposal=1
     )
     return PICTURE.stat().st_size
 
@@ -110,11 +144,12 @@ def main() -> None:
         page = browser.new_page(viewport={"width": SHOWN[0], "height": SHOWN[1]})
         page.set_default_timeout(120_000)
         page.goto(server.url)
-        frames = play(page)
+        film = play(page)
         browser.close()
         server.close()
-    count = write(frames)
-    print(f"{PICTURE}: {len(frames)} frames, {count:,} bytes")
+    count = write(film.frames, film.milliseconds)
+    moving = sorted(each for each in film.milliseconds if each != RESTING)
+    print(f"{PICTURE}: {len(film.frames)} frames, of {moving[len(moving) // 2]:.0f} ms in the middle, {count:,} bytes")
     if count > MOST_BYTES:
         raise ValueError(f"the picture must have at most {MOST_BYTES:,} bytes, got {count:,}")
 

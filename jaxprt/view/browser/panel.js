@@ -3,8 +3,8 @@
 import { clamp, dot, element, half, hex, toDisplay, unhex } from "./common.js";
 import { TONES } from "./drawing.js";
 
-const MANY = 3; // parts from which on their controls are folded
-const FILTER = 10; // parts from which on their names can be searched
+const MANY = 3; // parts up to which all of their controls are open at first; of more, the first
+const FILTER = 10; // parts up to which one is open at first; of more, names can be searched
 const DEGREE = Math.PI / 180;
 
 const section = (panel, title, open = true, className = "") => {
@@ -91,7 +91,10 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
     const search = element("input", row(materialPart, "find a part"), { type: "text" });
     search.oninput = () => { for (const [name, part] of parts) part.box.hidden = !name.toLowerCase().includes(search.value.toLowerCase()); };
   }
-  for (const part of free) parts.set(part.name, materialOf(materialPart, part, state, free.length <= MANY, moved));
+  for (const part of free) {
+    const opened = free.length <= MANY || (!parts.size && free.length <= FILTER);
+    parts.set(part.name, materialOf(materialPart, part, state, opened, moved));
+  }
   return {
     show() {
       if (light.length !== scene.lights.length) light.fill(scene.lights);
