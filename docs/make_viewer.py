@@ -65,8 +65,11 @@ class Film:
         self.milliseconds.append(milliseconds)
 
     def rest(self) -> None:
-        """Adds the picture at rest, once it has come."""
-        self.page.wait_for_timeout(4000)
+        """Adds the picture at rest, once it has come: nothing has been drawn for two seconds."""
+        draws, before = f"() => {_ROOT}.querySelector('.canvas').stats.draws", -1
+        while before != (now := self.page.evaluate(draws)):
+            before = now
+            self.page.wait_for_timeout(2000)
         self.take(RESTING)
 
     def drag(self, start: tuple[float, float], places: Sequence[tuple[float, float]]) -> None:

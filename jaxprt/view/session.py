@@ -7,6 +7,7 @@ import re
 import tempfile
 import threading
 import time
+import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -219,11 +220,14 @@ class Session:
         width, height, coarse = _size(message)
         began, between = time.perf_counter(), self._between(message, seq)
         between()
-        picture = self.stages.picture(look, width, height, samples=1 if coarse else 4, between=between)
-        data, scale = messages.encode(picture, stops=_stops(message), tone=_tone(message))
+        clear = messages.truth(message, "transparent")
+        make = self.stages.cutout if clear else self.stages.picture
+        picture = make(look, width, height, samples=1 if coarse else 4, between=between)
+        data, scale = messages.encode(picture[..., :3], stops=_stops(message), tone=_tone(message))
+        alpha = [zlib.compress(np.round(255 * picture[..., 3]).astype(np.uint8).tobytes(), 1)] if clear else []
         spent = 1000 * (time.perf_counter() - began)
         size = {"width": width, "height": height}
-        return Reply({"kind": "still", "seq": seq, "scale": scale, "ms": spent, **size}, [data])
+        return Reply({"kind": "still", "seq": seq, "scale": scale, "ms": spent, **size}, [data, *alpha])
 
     def _exact(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         """The exact picture under direct light of the environment, and the relit picture's error at some pixels."""

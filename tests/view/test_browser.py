@@ -109,7 +109,6 @@ def drawn(hand, systems, lights, shadows="rays"):
 
 
 def test_the_canvas_shows_what_python_draws(hand, systems, lights):
-    hand.page.keyboard.press("g")
     hand.page.locator("canvas.canvas").focus()
     hand.still()
     off = np.abs(hand.pixels() - drawn(hand, systems, lights)).max(-1)

@@ -184,6 +184,7 @@ def test_typed_numbers_change_the_scene_and_the_sliders(hand):
     assert hand.state()["materials"]["ball"]["metallic"] == 1
     assert hand.page.get_by_label("metallic, typed").input_value() == "1"
     assert hand.page.locator("canvas.plane").is_hidden()  # of a metal the base color is the reflectance
+    assert hand.page.get_by_label("specular F0, typed").is_disabled()
     typed(hand, "metallic", "0.5")
     assert hand.page.locator("canvas.plane").is_visible()
     typed(hand, "specular F0", "0.2")
@@ -194,6 +195,22 @@ def test_typed_numbers_change_the_scene_and_the_sliders(hand):
     hand.page.get_by_role("button", name="as it was").first.click()
     hand.settle()
     assert hand.state()["materials"] == {}
+
+
+def test_a_picture_at_rest_has_no_background_where_there_is_none(hand, systems, lights):
+    hand.page.locator("canvas.canvas").focus()
+    hand.page.evaluate(f"() => ({CANVAS}).camera().zoom(2)")
+    hand.page.keyboard.press("g")
+    hand.still()
+    state, camera, shown = hand.state(), hand.camera(), hand.pixels()
+    height, width = shown.shape[:2]
+    eye = Camera(camera["eye"], camera["target"], [0.0, 1.0, 0.0], camera["angle"], width, height)
+    cover = np.asarray(systems["lobes"].coverage(eye))
+    assert 0.1 < np.mean(cover == 0) < 0.9
+    np.testing.assert_allclose(shown[cover == 0], 0.1, atol=1 / 255)
+    inside = image.display(systems["lobes"].picture(lights["lamp"], eye), stops=state["stops"])
+    off = np.abs(shown - inside)[cover == 1]
+    assert np.quantile(off, 0.997) < 2.5 / 255  # rays of a few pixels pass an edge on the other side
 
 
 def test_a_matte_part_has_a_base_color_alone(hand):

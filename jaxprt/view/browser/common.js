@@ -20,11 +20,15 @@ export function element(tag, parent, fields = {}) {
 // Colors that Python has exposed, made bytes, and compressed: differences, channel by channel. Where a mask comes with
 // them, one bit for each entry, they are those of its entries alone; the others stay as they were.
 export async function inflate(data, count, before, mask) {
-  const stream = new Blob([data]).stream().pipeThrough(new DecompressionStream("deflate"));
-  const plane = new Uint8Array(await new Response(stream).arrayBuffer()), entries = plane.length / 3;
+  const plane = await decompressed(data), entries = plane.length / 3;
   const result = mask ? before : new Uint8Array(3 * count), bit = (i) => !mask || (mask.getUint8(i >> 3) >> (7 - (i & 7))) & 1;
   for (let c = 0; c < 3; c++) for (let i = 0, from = c * entries, value = 0; i < count; i++) if (bit(i)) result[3 * i + c] = value = (value + plane[from++]) & 255;
   return result;
+}
+
+export async function decompressed(data) {
+  const stream = new Blob([data]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
 // A message and its arrays from one string of bytes, as Python's `messages.pack` has made it.

@@ -1,6 +1,7 @@
 // Draws the sky, the mesh with colors at its vertices, and pictures at rest.
 
 import { clamp, toLinear } from "./common.js";
+import { toHalf } from "./lights.js";
 import { WIDTH } from "./shading.js";
 import { drawSides } from "./pixels.js";
 
@@ -43,7 +44,7 @@ precision highp float; in vec2 at; out vec4 o; uniform sampler2D image; ${DISPLA
 void main(){ vec4 c = textureLod(image, at, 0.); o = vec4(display(c.rgb / max(c.a, 1e-3)), c.a); }`; // colors times coverage
 const STILL = `#version 300 es
 precision highp float; in vec2 at; out vec4 o; uniform sampler2D image; uniform float alpha; ${DISPLAY}
-void main(){ o = vec4(display(textureLod(image, vec2(at.x, 1. - at.y), 0.).rgb), alpha); }`;
+void main(){ vec4 c = textureLod(image, vec2(at.x, 1. - at.y), 0.); o = vec4(display(c.rgb), alpha * c.a); }`;
 
 export const TONES = ["srgb", "filmic", "agx", "aces"];
 
@@ -109,13 +110,13 @@ export class Drawing {
     this.scale = scale;
     this.drawn = true;
   }
-  texture(data, width, height, encoded, repeat) {
+  texture(data, width, height, encoded, repeat, alpha = false) {
     const gl = this.gl, made = gl.createTexture();
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, made);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-    if (encoded) gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, width, height, 0, gl.RGB, gl.UNSIGNED_BYTE, data);
-    else gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB16F, width, height, 0, gl.RGB, gl.HALF_FLOAT, data);
+    const [form, bytes, halves] = alpha ? [gl.RGBA, gl.RGBA8, gl.RGBA16F] : [gl.RGB, gl.RGB8, gl.RGB16F];
+    gl.texImage2D(gl.TEXTURE_2D, 0, encoded ? bytes : halves, width, height, 0, form, encoded ? gl.UNSIGNED_BYTE : gl.HALF_FLOAT, data);
     for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.LINEAR);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, repeat ? gl.REPEAT : gl.CLAMP_TO_EDGE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
@@ -133,9 +134,17 @@ export class Drawing {
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
     [this.skyScale, this.skyHeight] = [scale, height];
   }
-  addStill(data, width, height, encoded, scale) {
+  addStill(data, width, height, encoded, scale, cover = null) { // cover: bytes of alpha, where no background is seen
     this.dropStills(1);
-    this.stills.push({ image: this.texture(data, width, height, encoded, false), encoded, scale, since: performance.now() });
+    let all = data;
+    if (cover) {
+      all = new data.constructor(4 * width * height);
+      for (let i = 0; i < width * height; i++) {
+        for (let c = 0; c < 3; c++) all[4 * i + c] = data[3 * i + c];
+        all[4 * i + 3] = encoded ? cover[i] : toHalf(cover[i] / 255);
+      }
+    }
+    this.stills.push({ image: this.texture(all, width, height, encoded, false, cover !== null), encoded, scale, clear: cover !== null, since: performance.now() });
   }
   dropStills(kept) { while (this.stills.length > kept) this.gl.deleteTexture(this.stills.shift().image); }
   quad(program, image, gain, encoded, tone) {
@@ -196,6 +205,7 @@ export class Drawing {
     gl.enable(gl.BLEND);
     for (const each of this.stills) {
       alpha = clamp((now - each.since) / FADE, 0, 1);
+      if (each.clear && alpha === 1) gl.clear(gl.COLOR_BUFFER_BIT); // edges of what was drawn before lie beside its own
       this.quad(this.still, each.image, gain * each.scale, each.encoded, tone);
       gl.uniform1f(this.still.at("alpha"), alpha);
       gl.drawArrays(gl.TRIANGLES, 0, 3);

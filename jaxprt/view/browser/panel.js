@@ -27,10 +27,11 @@ function slider(parent, text, { low, high, step, at = (x) => x, of = (x) => x, d
   range.setAttribute("aria-label", text);
   number.setAttribute("aria-label", `${text}, typed`);
   range.oninput = () => pick(at(Number(range.value)));
-  number.onchange = () => { if (number.value !== "" && Number.isFinite(Number(number.value))) pick(wrap(Number(number.value))); made.show(made.value); };
+  number.onchange = () => { if (number.value !== "" && Number.isFinite(Number(number.value))) pick(wrap(Number(number.value))); made.show(made.value, !number.disabled); };
   number.onkeydown = (event) => { if (event.key === "Enter") number.onchange(); };
-  made.show = (value) => {
+  made.show = (value, acts = true) => {
     made.value = value;
+    range.disabled = number.disabled = !acts;
     const shown = String(Number(value.toFixed(digits)));
     if (range.value !== String(of(value))) range.value = of(value);
     if (number.value !== shown) number.value = shown;
@@ -205,16 +206,17 @@ function materialOf(parent, part, state, opened, moved) {
   const made = section(parent, part.name, opened, "part");
   const change = (fields) => { state.materials = { ...state.materials, [part.name]: { ...state.materials[part.name], ...fields } }; show(); moved(); };
   const blinn = free.exponent !== undefined, metallic = free.metallic !== undefined, shows = [];
-  const color = (text, name) => {
+  const reflects = () => !metallic || value("metallic") < 1; // of a metal the base color is the reflectance
+  const color = (text, name, acts = () => true) => {
     if (!free[name]) return;
     const input = element("input", row(made, text), { type: "color" });
     input.oninput = () => change({ [name]: unhex(input.value) });
-    shows.push(() => { input.value = hex(value(name)); });
+    shows.push(() => { input.value = hex(value(name)); input.disabled = !acts(); });
   };
   const number = (text, name, options) => {
     if (free[name] === undefined) return;
     const control = slider(made, text, { digits: 3, ...options }, (x) => change({ [name]: x }));
-    shows.push(() => control.show(value(name)));
+    shows.push(() => control.show(value(name), options.acts?.() ?? true));
   };
   const [low, high] = free.exponent_range ?? free.roughness_range ?? [0, 1], span = high / low;
   const power = { low, high, digits: 1, at: (x) => low * span ** x, of: (x) => Math.log(x / low) / Math.log(span) };
@@ -222,11 +224,11 @@ function materialOf(parent, part, state, opened, moved) {
   number("metallic", "metallic", { low: 0, high: 1 });
   if (free.roughness_range) number("roughness", "roughness", { low, high });
   if (blinn) number("exponent", "exponent", power);
-  number(blinn ? "specular" : "specular F0", "f0", { title: "reflectance at normal incidence",  low: 0, high: 1, at: (x) => x * x, of: Math.sqrt });
-  color("specular tint", "specular");
+  number(blinn ? "specular" : "specular F0", "f0", { title: "reflectance at normal incidence of what is not metal", acts: reflects,  low: 0, high: 1, at: (x) => x * x, of: Math.sqrt });
+  color("specular tint", "specular", reflects);
   const across = blinn ? "exponent" : free.roughness_range ? "roughness" : null;
-  // Of Blinn-Phong the exponent falls to the right, as roughness grows. Metals have the base color as their reflectance.
-  if (across && free.f0 !== undefined) shows.push(planeOf(made, { across, low, high, value, change, hidden: () => metallic && value("metallic") >= 1 }));
+  // Of Blinn-Phong the exponent falls to the right, as roughness grows.
+  if (across && free.f0 !== undefined) shows.push(planeOf(made, { across, low, high, value, change, hidden: () => !reflects() }));
   const reset = element("button", element("div", made, { className: "row" }), { type: "button", textContent: "as it was" });
   reset.onclick = () => { const { [part.name]: _, ...others } = state.materials; state.materials = others; show(); moved(); };
   shows.push(() => { reset.disabled = !state.materials[part.name]; });

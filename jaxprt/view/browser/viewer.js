@@ -1,7 +1,7 @@
 // The viewer: mesh and camera live here, colors come from Python. The same module runs in notebooks (anywidget calls
 // `render`) and on a page of its own (`mount`). No libraries.
 
-import { add, clamp, inflate, unit } from "./common.js";
+import { add, clamp, decompressed, inflate, unit } from "./common.js";
 import { Camera, meet } from "./camera.js";
 import { Drawing } from "./drawing.js";
 import { Piece } from "./piece.js";
@@ -183,12 +183,13 @@ export function mount(root, ask) {
     try {
       for (const [kind, coarse] of steps) {
         if (kind === "exact") tell("the exact picture is on its way");
-        const asked = { ...message(kind), ...size, coarse }, { content, buffers } = await ask(asked);
+        const asked = { ...message(kind), ...size, coarse, transparent: kind === "still" && !state.background }, { content, buffers } = await ask(asked);
         if (closed || own !== seq || content.kind === "late") break;
         if (content.kind === "error") { tell(content.message); break; }
         const compressed = asked.stops !== null, count = content.width * content.height;
         const data = compressed ? await inflate(buffers[0], count) : new Uint16Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 2);
-        drawing.addStill(data, content.width, content.height, compressed, content.scale);
+        const cover = asked.transparent ? await decompressed(buffers[1]) : null;
+        drawing.addStill(data, content.width, content.height, compressed, content.scale, cover);
         stats[coarse ? "coarse" : "stills"]++;
         if (kind === "still" && !coarse) rest = { size: name, made: rest.made + 1, ms: content.ms };
         if (kind === "exact" && !coarse) {
