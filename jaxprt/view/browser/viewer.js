@@ -130,7 +130,7 @@ export function mount(root, ask) {
         long = long ? stats.trip - spent > 15 : stats.trip - spent > 60 + spent;
         stats.got++;
         stats.bytes += sent;
-        stats.shown = content.seq;
+        stats.shown = Math.max(stats.shown, content.seq); // the GPU may have shown a newer state
         if (content.seq === seq) tell("");
         const rate = framed ? 1000 / (performance.now() - framed) : 0;
         framed = performance.now();
