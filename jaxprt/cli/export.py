@@ -55,7 +55,7 @@ _BAKED, _TRANSFER = "baked", "gltf"  # formats of *.glb
     group="System",
     type=options.Bounces(),
     default="0",
-    help='Number of bounces between parts, or "all", in *.glb files. Pages have no bounces.  [default: 0]',
+    help='Number of bounces between parts, or "all". Pages reflect their light diffusely.  [default: 0]',
 )
 @options.few_sizes
 @option(

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int8
 
 from jaxprt.brdf import GGX, BlinnPhong, CookTorrance
 from jaxprt.brdf.varying import Channels
@@ -98,7 +98,21 @@ def scene_content(page: PageScene) -> tuple[dict[str, Any], list[bytes]]:
     joined = [np.concatenate(column) for column in arrays]
     joined.insert(3, tables.joined())
     joined[2] = np.append(joined[2], np.zeros(4 - len(joined[2]) % 4, np.uint8))  # whole words
-    return content, [array.tobytes() for array in joined]
+    added, reflected = _reflected(page)
+    return content | added, [array.tobytes() for array in (*joined, reflected)]
+
+
+def _reflected(page: PageScene) -> tuple[dict[str, Any], Int8[np.ndarray, " n"]]:
+    """What bounces and lamps add at each vertex: units of the rows, and for each row three colors in a word."""
+    if page.reflected is None:
+        return {"reflectedUnit": []}, np.zeros(0, np.int8)
+    unit = unit_of(page.reflected)
+    columns = []
+    for rows, part in zip(page.reflected, page.parts, strict=True):
+        column = np.zeros((part.vector.shape[1], len(unit), 4), np.int8)
+        column[:, : len(rows), :3] = np.round(rows / unit[: len(rows), None, None]).transpose(2, 0, 1)
+        columns.append(column.reshape(-1))
+    return {"reflectedUnit": unit.tolist()}, np.concatenate(columns)
 
 
 def _normals(page: PageScene) -> list[Float[np.ndarray, "v 3"]]:

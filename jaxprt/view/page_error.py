@@ -15,6 +15,7 @@ from jaxprt.relit.groups import faces_of
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Camera, Environment, sides
 from jaxprt.view import stages
+from jaxprt.view.reduced import PageScene
 
 NOTABLE = 0.05  # relative L2 error above which causes are measured
 _VIEWS = 4  # views around the scene
@@ -22,8 +23,10 @@ _EDGE = 96  # edge of the pictures in pixels
 _SMALL = 0.2  # of the error: causes below it are not named
 _REMEDIES = {
     "shadows": "edges of shadows that lie between vertices: divide the meshes finer (refine)",
-    "bounces": "light that parts reflect onto each other, of which the page has none: precompute without bounces",
-    "lamps": "light of lamps, of which the page has none: show the scene in the viewer instead",
+    "bounces": "light that parts reflect onto each other, which the page reflects on diffusely and by few harmonics: "
+    "precompute without bounces, or show the scene in the viewer",
+    "lamps": "light of lamps, which the page interpolates between vertices and reflects diffusely: show the scene in "
+    "the viewer",
     "layers": "clear coats and sheens, which the page leaves out: give the parts materials without them",
     "visibility": "coarse visibility and tables: allow the page more bytes (most), or take more lobes (lobes)",
 }
@@ -110,7 +113,7 @@ class _Views(NamedTuple):
         return np.concatenate(rows)
 
 
-def measure(scene: RelitScene, page: RelitScene, lights: Mapping[str, Environment]) -> PageError:
+def measure(scene: RelitScene, page: PageScene, lights: Mapping[str, Environment]) -> PageError:
     """Measures the pictures of a page against those of the scene, over four views around it.
 
     Pictures of the scene trace the shadows of bright texels and reflections from each pixel. Pixels of the page
@@ -118,18 +121,18 @@ def measure(scene: RelitScene, page: RelitScene, lights: Mapping[str, Environmen
 
     Args:
         scene: The scene, with its origin at zero.
-        page: The scene as the page relights it.
+        page: The scene as the page holds it.
         lights: The lights of the page.
     """
     views = _Views.around(scene)
-    error, name, whole, off = -1.0, "", np.zeros((1, 3)), np.zeros((1, 3))
+    error, name, whole, shown = -1.0, "", np.zeros((1, 3)), np.zeros((1, 3))
+    reduced = page.relit()
     for key, light in lights.items():
-        right = views.pictures(scene, light, "rays")
-        wrong = views.pictures(page, light, "vertices") - right
-        now = _relative(wrong, right)
+        right, approximate = views.pictures(scene, light, "rays"), views.pictures(reduced, light, "vertices")
+        now = _relative(approximate - right, right)
         if now > error:
-            error, name, whole, off = now, key, right, wrong
-    causes = _causes(views, scene, lights[name], whole, off) if error > NOTABLE else ()
+            error, name, whole, shown = now, key, right, approximate
+    causes = _causes(views, scene, page, lights[name], whole, shown) if error > NOTABLE else ()
     return PageError(error, name, causes)
 
 
@@ -147,22 +150,34 @@ def _relative(off: Float[np.ndarray, "n 3"], whole: Float[np.ndarray, "n 3"]) ->
 def _causes(
     views: _Views,
     scene: RelitScene,
+    page: PageScene,
     light: Environment,
     whole: Float[np.ndarray, "n 3"],
-    off: Float[np.ndarray, "n 3"],
+    shown: Float[np.ndarray, "n 3"],
 ) -> tuple[Cause, ...]:
-    """What the page lacks, one after another: what each step from the scene to the page changes."""
+    """What each step from the scene to the page changes: shadows of vertices, then less and less light in both.
+
+    Args:
+        views: The views.
+        scene: The scene.
+        page: The scene as the page holds it.
+        light: The light.
+        whole: Pictures of the scene.
+        shown: Pictures of the page.
+    """
     now = views.pictures(scene, light, "vertices")
     steps = {"shadows": whole - now}
-    if scene.bounces is not None:
-        scene, before = scene.without_bounces(), now
-        now = views.pictures(scene, light, "vertices")
-        steps["bounces"] = before - now
     if scene.lamps is not None:
-        scene, before = _without_lamps(scene), now
-        now = views.pictures(scene, light, "vertices")
-        steps["lamps"] = before - now
-    rest = now - (whole + off)
+        scene, page = _without_lamps(scene), page.with_reflected(bounces=True, lamps=False)
+        before, had = now, shown
+        now, shown = views.pictures(scene, light, "vertices"), views.pictures(page.relit(), light, "vertices")
+        steps["lamps"] = (before - now) - (had - shown)
+    if scene.bounces is not None:
+        scene, page = scene.without_bounces(), page.with_reflected(bounces=False, lamps=False)
+        before, had = now, shown
+        now, shown = views.pictures(scene, light, "vertices"), views.pictures(page.relit(), light, "vertices")
+        steps["bounces"] = (before - now) - (had - shown)
+    rest = now - shown
     layered = np.asarray([shading.layered for shading in scene.shading])[views.part][:, None]
     if layered.any():
         steps["layers"] = rest * layered

@@ -78,12 +78,16 @@ def export(
 ) -> Piece:
     """Writes an HTML page that shows and relights a scene on the browser's GPU, without Python.
 
-    The page contains the viewer and all data. It computes direct light only. Ideally diffuse parts use transfer vectors
+    The page contains the viewer and all data. Ideally diffuse parts use transfer vectors
     and parts of the system "harmonic" use transfer matrices, from harmonics of their visibility; both are stored as
     bytes. Other parts use lobes and averaged visibility. All are stored as finely as `most` permits. If they fit, the
     brightest texels of the light are summed one by one on the parts that support it. As in the viewer, the user can
     rotate or replace the light, add lamps, and change materials that are constant over a part. A Radiance HDR file that
-    is dropped on the page becomes a light. Bounces, lamps, clear coats and sheens are left out, with a warning.
+    is dropped on the page becomes a light.
+
+    Light of bounces and lamps is stored as what it adds to the irradiance of the vertices: that of bounces for lights
+    of 25 harmonics, with the materials that the scene has, and that of lamps as it is. Other materials and strengths
+    of lamps do not change it. Highlights of it, clear coats and sheens are left out, with a warning.
 
     Args:
         scene: The result of `jaxprt.precompute`, with systems that say what a page holds of them, such as "lobe".
@@ -109,12 +113,10 @@ def export(
         require.number("error", error, 0.0)
     path = outputs.target(path, ".html")
     scene = scene.centered()
-    absent = [name for name, light in (("bounces", scene.bounces), ("lamps", scene.lamps)) if light is not None]
-    if absent:
-        warnings.warn(f"the page has the light of environments alone, without {' and '.join(absent)}", stacklevel=2)
     session = Session(scene, environments=environments)
     lights = dict(zip(session.stages.name, session.stages.lights, strict=True))
     whole = PageScene.of(scene)
+    _warn_of_reflections(scene, whole)
     # Sharp shadows of a small sun matter more than finely averaged visibility.
     least = 0
     for texels, size in _sizes(whole):
@@ -123,7 +125,7 @@ def export(
         least = len(_page(session, reduced, lights, contents, error=0.0, title=path.stem))
         if least > most + _SPARE:
             continue
-        measured = page_error.measure(scene, reduced.relit(), lights)
+        measured = page_error.measure(scene, reduced, lights)
         if error is not None and measured.error > error:
             raise ValueError(measured.refusal(error))
         page = _page(session, reduced, lights, contents, error=measured.error, title=path.stem)
@@ -137,6 +139,23 @@ def export(
     raise ValueError(
         f"most must be at least about {least} bytes, the size of the page with the coarsest visibility, got {most}"
     )
+
+
+def _warn_of_reflections(scene: RelitScene, page: PageScene) -> None:
+    """Warns of parts whose reflections of bounces and lamps the page leaves out in part."""
+    if page.reflected is None:
+        return
+    what = " and ".join(name for name, light in (("bounces", scene.bounces), ("lamps", scene.lamps)) if light)
+    none = [name for name, rows in zip(scene.scene.names, page.reflected, strict=True) if not len(rows)]
+    glossy = [part.name for part, held in zip(scene.scene.parts, page.parts, strict=True) if held.brdf is not None]
+    glossy = [name for name in glossy if name not in none]
+    words = []
+    if glossy:
+        words.append(f"these parts reflect it diffusely, without highlights: {', '.join(map(repr, glossy))}")
+    if none:
+        words.append(f"these parts do not reflect it: {', '.join(map(repr, none))}")
+    if words:
+        warnings.warn(f"the page has light of {what} in part: {'; '.join(words)}", stacklevel=3)
 
 
 class _Size(NamedTuple):

@@ -25,6 +25,8 @@ from jaxprt.systems.lobe.exported import lobe_description, lobe_entries
 from jaxprt.systems.lobe.pyramid import Scales
 from jaxprt.systems.protocol import Blend, Exported, System
 from jaxprt.systems.standard.layered import BASE
+from jaxprt.view import reflected
+from jaxprt.view.reflected import ReflectingSystem
 
 FIRST = 2  # finest scale of visibility that is stored as bytes
 MOST_BYTES = 2**27  # largest buffer that graphics cards accept
@@ -34,7 +36,7 @@ _TEXELS = 64  # number of brightest texels that are summed one by one
 
 @dataclasses.dataclass(frozen=True)
 class PageScene:
-    """A scene as an exported page holds it: direct light only, and no clear coats and sheens.
+    """A scene as an exported page holds it: bounces and lamps for diffuse responses only, no clear coats and sheens.
 
     Attributes:
         scene: The scene.
@@ -45,6 +47,8 @@ class PageScene:
         level: Finest scale of the visibility of lobes.
         unshadowed: Edge of the faces of the light, if nothing of the visibility is known and the page shows the scene
             without shadows; 0 with visibility.
+        reflected: What bounces and lamps add to the irradiance of each part, from `jaxprt.view.reflected.transfer`,
+            without rows for parts with transfer matrices; None for a scene without both.
     """
 
     scene: Scene
@@ -53,6 +57,7 @@ class PageScene:
     texels: Sequence[Any] | None
     level: int = 0
     unshadowed: int = 0
+    reflected: Sequence[Float[np.ndarray, "_ 3 _"]] | None = None
 
     @classmethod
     def without_visibility(cls, parts: Sequence[Part], shadings: Sequence[Shading], size: int) -> "PageScene":
@@ -83,15 +88,18 @@ class PageScene:
         lacking = [part.scales is not None for part, seen in zip(parts, texels, strict=True) if seen is None]
         seen = None if any(lacking) or len(lacking) == len(parts) else texels
         scene, shading, layered = relit.scene, relit.shading, [shading.layered for shading in relit.shading]
+        added = reflected.transfer(relit)
+        if added is not None:
+            added = [rows if part.degree is None else rows[:0] for rows, part in zip(added, parts, strict=True)]
         if not any(layered):
-            return cls(scene, shading, parts, seen)
+            return cls(scene, shading, parts, seen, reflected=added)
         lost = ", ".join(repr(name) for name, has in zip(names, layered, strict=True) if has)
         warnings.warn(f"the page shows these parts without their clear coats and sheens: {lost}", stacklevel=3)
         rows = list(zip(layered, scene.parts, shading, parts, strict=True))
         scene = dataclasses.replace(scene, parts=[_bare(part) if has else part for has, part, *_ in rows])
         shading = [_base_shading(shading) if has else shading for has, _, shading, _ in rows]
         parts = [part.with_table(standard.METALLIC_ROUGHNESS) if has else part for has, *_, part in rows]
-        return cls(scene, shading, parts, seen)
+        return cls(scene, shading, parts, seen, reflected=added)
 
     @classmethod
     def for_gpu(cls, relit: RelitScene) -> "PageScene":
@@ -128,7 +136,17 @@ class PageScene:
         vectors, visible = ([getattr(part, name) for part in parts] for name in ("vector", "visible"))
         rounded = zip(parts, _rounded(vectors), _rounded(visible), strict=True)
         parts = [dataclasses.replace(part, vector=vector, visible=seen) for part, vector, seen in rounded]
-        return dataclasses.replace(self, parts=parts, texels=self.texels if texels else None, level=level)
+        added = None if self.reflected is None else _rounded(self.reflected)
+        seen = self.texels if texels else None
+        return dataclasses.replace(self, parts=parts, texels=seen, level=level, reflected=added)
+
+    def with_reflected(self, *, bounces: bool, lamps: bool) -> "PageScene":
+        """The scene with only some of what bounces and lamps add; the form of the arrays stays."""
+        if self.reflected is None:
+            return self
+        keep = np.array([*[bounces] * (reflected.ROWS - 1), lamps], float)[:, None, None]
+        added = [rows * keep[: len(rows)] for rows in self.reflected]
+        return dataclasses.replace(self, reflected=added)
 
     def relit(self) -> RelitScene:
         """The scene as the page relights it."""
@@ -138,6 +156,12 @@ class PageScene:
             systems = [
                 system if seen is None else _with_texels(system, seen, part, shading)
                 for system, seen, part, shading in rows
+            ]
+        if self.reflected is not None:
+            pairs = zip(systems, self.reflected, strict=True)
+            systems = [
+                ReflectingSystem(system, put(rows.astype(jnp.result_type(float)))) if len(rows) else system
+                for system, rows in pairs
             ]
         return RelitScene(self.scene, self.shading, Place.apart(self.scene.counts), systems)
 
@@ -279,12 +303,16 @@ def unit_of(values: Sequence[np.ndarray]) -> Float[np.ndarray, " k"]:
     """Quantization step of the signed bytes for each row, which all parts share."""
     largest = np.zeros(max(map(len, values)))
     for rows in values:
-        largest[: len(rows)] = np.maximum(largest[: len(rows)], np.abs(rows).max(1, initial=0))
+        now = np.abs(rows).max(tuple(range(1, rows.ndim)), initial=0)
+        largest[: len(rows)] = np.maximum(largest[: len(rows)], now)
     return np.maximum(largest, 1e-12) / 127
 
 
 def _rounded(values: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Values that are multiples of their steps, as systems hold them."""
-    unit = unit_of(values)[:, None]
-    rounded = [np.round(rows / unit[: len(rows)]) * unit[: len(rows)] for rows in values]
+    unit = unit_of(values)
+    rounded = []
+    for rows in values:
+        step = unit[: len(rows)].reshape(-1, *[1] * (rows.ndim - 1))
+        rounded.append(np.round(rows / step) * step)
     return [np.asarray(rows.astype(jnp.result_type(float)), np.float64) for rows in rounded]

@@ -14,13 +14,14 @@ from jaxprt.brdf import BlinnPhong
 from jaxprt.compile import put
 from jaxprt.relit.groups import Place
 from jaxprt.relit.scene import RelitScene
-from jaxprt.scene import Environment, Part, Scene, TexturedMaterial, builtin
+from jaxprt.scene import Environment, Part, PointLight, Scene, TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
+from jaxprt.sphere import cubemap, harmonics
 from jaxprt.view import messages, page_error, stages
 from jaxprt.view.content import scene_content
 from jaxprt.view.reduced import PageScene
 
-pytestmark = pytest.mark.filterwarnings("ignore:the page has the light of environments alone, without bounces")
+pytestmark = pytest.mark.filterwarnings("ignore:the page has light of bounces in part")
 
 SHOWN = 'mount(document.getElementById("viewer"), answers(content, buffers));'
 ASKED = """async (message) => {
@@ -206,7 +207,7 @@ def test_causes_are_what_the_page_lacks(made, systems, lights):
     assert causes["shadows"].part == "ground"
     assert causes["shadows"].error == pytest.approx(made.error, rel=0.1)
     assert "shadows that lie between vertices" in str(causes["shadows"])
-    page = PageScene.of(systems["lobes"]).reduced(2, texels=True).relit()
+    page = PageScene.of(scene).reduced(2, texels=True)
     alone = page_error.measure(scene, page, {"lamp": light})
     assert {cause.name for cause in alone.causes} == {"shadows", "visibility"}
 
@@ -356,9 +357,51 @@ def test_what_a_page_does_not_have_is_refused(systems, tmp_path):
         view.export(systems["lobes"], tmp_path / "a.htm")
 
 
-def test_pages_say_that_bounces_stay_behind(systems, tmp_path):
-    with pytest.warns(UserWarning, match="the page has the light of environments alone, without bounces"):
-        view.export(systems["lobes"], tmp_path / "a.html", environments={"gray": Environment(np.ones((6, 8, 8, 1)))})
+def test_pages_say_which_reflections_they_leave_out(systems, tmp_path):
+    gray = {"gray": Environment(np.ones((6, 8, 8, 1)))}
+    words = "light of bounces in part: these parts reflect it diffusely, without highlights: 'ball'$"
+    with pytest.warns(UserWarning, match=words):
+        view.export(systems["lobes"], tmp_path / "a.html", environments=gray)
+
+
+@pytest.fixture(scope="module")
+def lit():
+    """A matte ball over a matte plane under a point light, with a bounce."""
+    ball, ground = builtin.sphere(rings=8, sectors=16), builtin.plane(cells=8)
+    ground = eqx.tree_at(lambda mesh: mesh.position, ground, ground.position * 3 - np.array([0, 1, 0], np.float32))
+    matte = [TexturedMaterial(base_color=color, metallic=0.0, specular=0.0) for color in ((0.8, 0.3, 0.2), 0.7)]
+    parts = [Part(*row) for row in zip(("ball", "ground"), (ball, ground), matte, strict=True)]
+    bulb = PointLight("bulb", [1.5, 2.0, 1.0], [9.0, 8.0, 7.0])
+    scene = Scene(parts, point_lights=[bulb])
+    return prt.precompute(scene, refine=False, system=prt.relit.Lobes(8), bounces=1, size=8, progress=False)
+
+
+LOW = 0.015  # of bytes, and of harmonics by texels of a light of 6 x 8 x 8
+
+
+def test_matte_scenes_have_their_bounces_and_lamps_in_pages(browser, lit, lights, look, tmp_path):
+    value = np.full(25, 0.1)
+    value[0] = 2.0
+    soft = harmonics.evaluate(cubemap.direction(size=8), degree=4) @ jnp.asarray(value, jnp.float32)
+    soft = {"soft": Environment(jnp.stack([soft, 2 * soft, soft], -1))}
+    eye = jnp.asarray(look["eye"])
+    true = np.asarray(lit.radiance(soft["soft"], eye=eye))
+    whole = PageScene.of(lit).reduced(2, texels=True)
+    variants = {
+        (bounces, lamps): off(
+            np.asarray(whole.with_reflected(bounces=bounces, lamps=lamps).relit().radiance(soft["soft"], eye=eye)), true
+        )
+        for bounces in (True, False)
+        for lamps in (True, False)
+    }
+    assert variants[True, True] < LOW
+    assert min(error for kept, error in variants.items() if kept != (True, True)) > 0.05
+    piece = view.export(lit, tmp_path / "lit.html", environments=soft)
+    page = Page(browser, piece.path)
+    assert off(page.color(look), true) < LOW
+    turned = np.asarray(lit.radiance(rotate(soft["soft"], stages.about(np.pi / 2)), eye=eye))
+    assert off(page.color(look | {"turn": np.pi / 2}), turned) < LOW
+    page.page.close()
 
 
 def test_environments_of_gray_are_lights_too(systems, tmp_path):

@@ -58,12 +58,9 @@ class ExportedMatrices(Exported):
     @property
     def diffuse(self) -> Float[np.ndarray, "lm v"]:
         """Transfer vectors of an ideally diffuse response: the matrices times a clamped cosine about the normal."""
-        degree = self.system.degree
-        band = np.arange(degree + 1)
-        upright = np.sqrt((2 * band + 1) / (4 * np.pi))  # harmonics of order zero in the direction of the normal
-        factor = np.asarray(harmonics.cosine(degree=degree), np.float64) / np.pi * upright
+        zonal = np.arange(self.system.degree + 1)
         matrix = np.asarray(self.system.transport.matrix, np.float64)[:, 0]
-        return np.einsum("l,vli->iv", factor, matrix[:, band * (band + 1)])
+        return np.einsum("l,vli->iv", upright_cosine(self.system.degree), matrix[:, zonal * (zonal + 1)])
 
     @property
     def degree(self) -> int:
@@ -121,3 +118,9 @@ class ExportedMatrices(Exported):
         matrix = from_visibility(visible, old.frame, degree=self.degree)[:, None]
         transport = TransferMatrix(matrix, old.position, old.frame)
         return dataclasses.replace(self.system, transport=transport, brdf=self.brdf)
+
+
+def upright_cosine(degree: int) -> Float[np.ndarray, " l"]:
+    """Factors of the harmonics of order zero in a vertex's frame, whose sum is irradiance / pi."""
+    band = np.arange(degree + 1)
+    return np.asarray(harmonics.cosine(degree=degree), np.float64) / np.pi * np.sqrt((2 * band + 1) / (4 * np.pi))

@@ -21,6 +21,7 @@ export class Piece {
     this.weights = next(Float32Array);
     this.visible = next(Int8Array);
     this.bits = next(Uint8Array);
+    this.reflected = next(Int8Array);
     this.index = new Map(content.rims.map((edge) => [edge, next(Uint32Array)]));
     this.lights = Array.from({ length: content.lights }, () => next(Float32Array));
     this.count = this.position.length / 3;
@@ -46,6 +47,7 @@ export class Piece {
     this.texture("table", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.table, 4);
     this.texture("weights", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.weights, 4);
     this.texture("visible", gl.RGBA8I, gl.RGBA_INTEGER, gl.BYTE, this.visible, 4);
+    this.texture("reflected", gl.RGBA8I, gl.RGBA_INTEGER, gl.BYTE, this.reflected, 4);
     for (const name of ["light", "bright", "gathered"]) this.texture(name, gl.RGBA32F, gl.RGBA, gl.FLOAT, none, 4);
     this.sights = Math.ceil(content.texels / 16) || 1;
     const shadows = content.visibility;
@@ -54,7 +56,7 @@ export class Piece {
     this.arrived = this.target("arrived", content.arrived);
     this.color = this.target("color", this.count);
     const bands = Math.max(1, ...content.parts.map((part) => part.bands)), knots = Math.max(2, ...content.parts.map((part) => part.knot.length));
-    const sizes = { SHADOWS: shadows ? 1 : 0, SIGHTS: this.sights, HARMONICS: 2 * Math.ceil(bands ** 2 / 2), BANDS: bands, KNOTS: knots, TERMS: content.terms, LEVELS: content.edges.length, WIDTHS: content.light.edges.length, STRIDE: content.stride, TEXELS: Math.max(content.texelEdge, 4) };
+    const sizes = { SHADOWS: shadows ? 1 : 0, SIGHTS: this.sights, HARMONICS: 2 * Math.ceil(bands ** 2 / 2), BANDS: bands, KNOTS: knots, TERMS: content.terms, REFLECTIONS: content.reflectedUnit.length, LEVELS: content.edges.length, WIDTHS: content.light.edges.length, STRIDE: content.stride, TEXELS: Math.max(content.texelEdge, 4) };
     const sized = (text, corners) => Object.entries({ ...sizes, CORNERS: corners }).reduce((result, [name, value]) => result.replaceAll(name, value), text);
     this.programs = { vertex: sized(SHADE, 1), pixel: sized(SHADE, 3), arrive: sized(ARRIVE), sight: sized(SIGHT), gather: GATHER };
     for (const [name, text] of Object.entries(this.programs)) this.programs[name] = this.link(WHOLE, text);
@@ -65,7 +67,8 @@ export class Piece {
       gl.uniform1fv(this.at("spreads", program), content.spreads);
       gl.uniform1fv(this.at("lightSpreads", program), content.light.spreads);
     }
-    this.degree = Math.max(Math.round(Math.sqrt(content.vectorUnit.length)), 1, ...content.parts.map((part) => part.bands)) - 1;
+    // The last row of reflections is the light of lamps, which no environment changes.
+    this.degree = Math.max(Math.round(Math.sqrt(content.vectorUnit.length)), 1, Math.floor(Math.sqrt(content.reflectedUnit.length)), ...content.parts.map((part) => part.bands)) - 1;
     for (const part of content.parts) part.written = "";
     [this.lit, this.turned, this.colored] = ["", "", null];
   }
@@ -162,8 +165,8 @@ export class Piece {
       this.mips = new Map();
       const all = this.radiance(message);
       let light = this.split(all);
-      // Parts without single texels are lit by all of the light.
-      this.all = light === all || content.parts.every((part) => part.texels) ? null : all;
+      // All of the light is reflected by other parts, and lights parts without single texels.
+      this.all = light === all || (!content.reflectedUnit.length && content.parts.every((part) => part.texels)) ? null : all;
       for (let edge = content.mips[0]; this.all && edge > 32 && edge > content.mips.at(-1); edge /= 2) this.all = halved(this.all, edge);
       for (const edge of content.mips) {
         this.mips.set(edge, light);
@@ -191,6 +194,8 @@ export class Piece {
       return result;
     });
     this.use(programs.arrive, this.arriving);
+    const last = content.reflectedUnit.length - 1, reflected = content.reflectedUnit.flatMap((unit, k) => [0, 1, 2].map((j) => unit * (k < last ? all[3 * k + j] : 1)));
+    if (reflected.length) gl.uniform3fv(this.at("reflectedLight", programs.arrive), reflected);
     for (const part of content.parts) {
       gl.uniform3fv(this.at("irradiance", programs.arrive), part.texels ? irradiance : irradianceOfAll);
       this.ints(programs.arrive, { first: part.first, count: part.count, terms: part.terms });

@@ -320,10 +320,10 @@ void main() { // of a texture with the vertices of the triangle at each pixel, a
   o = vec4(shade(), 1);
 }
 #endif`;
-// The irradiance of vertices / pi, by transfer vectors: made once for a light.
+// The irradiance of vertices / pi, by transfer vectors, and what bounces and lamps add: made once for a light.
 export const ARRIVE = `#version 300 es
 precision highp float; precision highp int; precision highp isampler2D;
-uniform isampler2D vectors; uniform vec3 irradiance[TERMS]; uniform int first, count, terms;
+uniform isampler2D vectors, reflected; uniform vec3 irradiance[TERMS], reflectedLight[REFLECTIONS + 1]; uniform int first, count, terms;
 out uvec4 o;
 ${AT}
 void main() {
@@ -335,6 +335,7 @@ void main() {
     vec4 each = vec4(texelFetch(vectors, at(id * (TERMS / 4) + i / 4), 0));
     result += irradiance[i] * each.x + irradiance[i + 1] * each.y + irradiance[i + 2] * each.z + irradiance[i + 3] * each.w;
   }
+  for (int i = 0; i < REFLECTIONS; i++) result += reflectedLight[i] * vec3(texelFetch(reflected, at(id * REFLECTIONS + i), 0).rgb);
   o = uvec4(floatBitsToUint(result), 0u);
 }`;
 // What vertices see of the brightest texels, sixteen at a time as bytes: bits, bilinear between the middles of texels.
