@@ -201,7 +201,7 @@ def test_why_a_scene_is_not_shaded_by_the_gpu_is_said(systems, lights, look):
     )
     session = Session({"lobes": bare, "others": others}, environments=lights)
     content, buffers = session.answer({"kind": "page", "system": "lobes"})
-    assert (content["kind"], content["visibility"], len(buffers)) == ("page", True, 7 + len(content["rims"]) + 2)
+    assert (content["kind"], content["visibility"], len(buffers)) == ("page", True, 8 + len(content["rims"]) + 2)
     content, buffers = session.answer({"kind": "page", "system": "others"})
     assert "part 'ball' must have the transfer matrices of direct light" in content["missing"]
     assert not buffers
