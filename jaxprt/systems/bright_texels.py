@@ -387,11 +387,17 @@ def texel_radiance(
 
     def lit(argument):
         direction, area, excess, visible = argument
-        share = visible.astype(wo.dtype) if points is None else points.carry(visible)
-        reflected = total(point, (direction, area)) * share
-        if weight is not None:
-            reflected = jnp.sum(reflected[:, None] * weight, 0)
-        return reflected * excess[:, None]
+
+        def seen(visible):
+            share = visible.astype(wo.dtype) if points is None else points.carry(visible)
+            reflected = total(point, (direction, area)) * share
+            if weight is not None:
+                reflected = jnp.sum(reflected[:, None] * weight, 0)
+            return reflected * excess[:, None]
+
+        shape = jax.eval_shape(seen, visible)
+        # No vertex of many rows sees a texel: those of a face that looks away, and texels that do not stand out.
+        return jax.lax.cond(jnp.any(visible > 0), seen, lambda _: jnp.zeros(shape.shape, shape.dtype), visible)
 
     def point(argument):
         direction, area = argument
