@@ -364,6 +364,28 @@ def test_a_file_that_cannot_be_loaded_is_compiled_anew(content, kept_files):
     assert len(kept_files.read(path.name)) > 1000
 
 
+def test_a_call_does_not_wait_for_a_program_of_another_shape(kept_files, monkeypatch):
+    function = kept(axes)
+    began, release, results = threading.Event(), threading.Event(), []
+    compile_now = function._executable
+
+    def held(operand, option, tree, aval):
+        if threading.current_thread() is slow:
+            began.set()
+            release.wait(60)
+        return compile_now(operand, option, tree, aval)
+
+    monkeypatch.setattr(function, "_executable", held)
+    slow = threading.Thread(target=lambda: results.append(function(camera(width=5))))
+    slow.start()
+    assert began.wait(60)
+    assert function(camera()).shape == (3, 3)
+    assert slow.is_alive()
+    release.set()
+    slow.join()
+    assert len(results) == 1
+
+
 def test_threads_compile_an_executable_once(kept_files):
     function = kept(axes)
     results: list[Any] = [None] * 4

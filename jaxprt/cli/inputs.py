@@ -196,6 +196,33 @@ def split_files(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     ]
 
 
+def check(options: SimpleNamespace) -> None:
+    """Refuses options that do not fit the files, before files are read.
+
+    Raises:
+        ValueError: A file is neither a mesh nor an environment, a ground is requested without a mesh, or the size of
+            the light is not a power of two.
+    """
+    _meshes(options)
+    _light_size(options, _SIZE)
+
+
+def _meshes(options: SimpleNamespace) -> list[Path]:
+    """The files that are meshes."""
+    paths, _ = split_files(options.files)
+    if not paths and options.ground:
+        raise ValueError("--ground needs a mesh: the embedded scene has a board")
+    return paths
+
+
+def _light_size(options: SimpleNamespace, size: int) -> int:
+    """Texels along the edge of the faces of lights."""
+    size = options.light_size or size
+    if size & (size - 1):
+        raise ValueError(f"--light-size must be a power of two, got {size}")
+    return size
+
+
 def scene(options: SimpleNamespace, *, playable: bool = False) -> Scene:
     """The upright scene of the files, with the requested materials. Without meshes it is the embedded scene.
 
@@ -206,9 +233,7 @@ def scene(options: SimpleNamespace, *, playable: bool = False) -> Scene:
     Raises:
         ValueError: A file is not a scene, a ground is requested without a mesh, or a part does not exist.
     """
-    paths, _ = split_files(options.files)
-    if not paths and options.ground:
-        raise ValueError("--ground needs a mesh: the embedded scene has a board")
+    paths = _meshes(options)
     result = _load_scenes(paths, options, playable) if paths else example_scene(brdf=options.brdf, playable=playable)
     parts = list(result.parts)
     for name, material in options.material:
@@ -245,9 +270,7 @@ def lights(options: SimpleNamespace, *, size: int = _SIZE) -> dict[str, Environm
         ValueError: The size is not a power of two, or a file is not an environment.
     """
     _, paths = split_files(options.files)
-    size = options.light_size or size
-    if size & (size - 1):
-        raise ValueError(f"--light-size must be a power of two, got {size}")
+    size = _light_size(options, size)
     if paths:
         names = unique([path.stem for path in paths])
         environments = {name: load_environment(path, size=size) for name, path in zip(names, paths, strict=True)}

@@ -4,6 +4,7 @@ import errno
 import socket
 import sys
 import threading
+import time
 import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,11 +18,23 @@ from jaxprt.cli.options import option
 from jaxprt.relit import RelitScene
 from jaxprt.relit.build import precompute
 from jaxprt.scene import Environment, Scene
-from jaxprt.view import serve
-from jaxprt.view.server import parse
+from jaxprt.view.server import Server, parse
+from jaxprt.view.session import Session
+from jaxprt.view.unshadowed import Unshadowed
 
 LOBES = 8  # the smallest number whose tables are shipped; fewer lobes take less time per look
 _PATIENCE = 0.5  # seconds; `jaxprt.cli.main.run` ends a process whose threads still compute
+_OPENING = 5.0  # most seconds in which a browser that was opened can still learn of an error
+# What the names of the work of `jaxprt.precompute` mean.
+_STAGES = {
+    "refine": "dividing the meshes where shadows are fine",
+    "visibility": "tracing rays",
+    "lamps": "tracing rays to lamps",
+    "compress": "compressing what the rays have seen",
+    "patches": "tracing light between surfaces",
+    "bounce": "tracing the first bounce",
+    "bounce 2": "tracing the second bounce",
+}
 
 
 @click.command(cls=options.Command, short_help="Show a scene in the interactive viewer in a browser.")
@@ -79,16 +92,24 @@ def command(**arguments: Any) -> None:
     check_address(arguments["address"])
     if arguments["output"] is not None:
         relight.make_folder(arguments["output"])
-    systems, lights = ready(SimpleNamespace(**arguments))
-    server = _serve(systems, lights, arguments["port"], arguments["address"])
+    chosen, session = SimpleNamespace(**arguments), Session()
+    inputs.check(chosen)
+    server = _serve(session, chosen.port, chosen.address)
     way = "" if arguments["address"] is None else f" through port {server.port} of this machine"
     click.echo(f"jaxprt: {server.url} shows the scene{way}; Ctrl-C ends it")
     sys.stdout.flush()
     if arguments["browser"] and arguments["address"] is None:  # a browser at another address is on another machine
         threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
+    session.prepare(lambda: prepare(session, chosen))
+    ready = False
     try:
+        session.progress.wait(patience=_OPENING if arguments["browser"] else 0.0)
+        ready = True
         server.wait()
     except KeyboardInterrupt:
+        if not ready:
+            raise
+    finally:
         server.close(patience=_PATIENCE)
 
 
@@ -131,36 +152,64 @@ def _no_port(port: int, error: OSError) -> ValueError:
     return ValueError(f"--port must be free, got {port}: {reason}; without --port a free one is taken")
 
 
-def _serve(systems: dict[str, RelitScene], lights: dict[str, Environment], port: int, address: str | None) -> Any:
+def _serve(session: Session, port: int, address: str | None) -> Server:
     try:
-        return serve(systems, environments=lights, port=port, address=address)
+        return Server(session, port=port, address=address)
     except OSError as error:
         raise _no_port(port, error) from error
 
 
-def ready(chosen: SimpleNamespace) -> tuple[dict[str, RelitScene], dict[str, Environment]]:
-    """The scene of the options, precomputed by each system, and its lights."""
-    scene, lights = inputs.scene(chosen, playable=True), inputs.lights(chosen)
-    systems = {}
-    for system in chosen.system:
-        for name, recipe in options.recipes(system, chosen, lobes=LOBES).items():
-            shown = {"lobe": f"{getattr(recipe, 'lobes', 0)} lobes", "harmonic": "harmonics"}.get(system, name)
-            # A folder is shared by systems with any number of lobes.
-            path = None if chosen.output is None else chosen.output / system
-            systems[shown] = precompute_scene(scene, lights, recipe, chosen.bounces, path)
-    return systems, lights
+class Report:
+    """Tells the page and the terminal what is being done: a line for each stage."""
+
+    def __init__(self, session: Session):
+        self._session, self._stage = session, ""
+
+    def __call__(self, label: str, share: float | None = None) -> None:
+        """Tells which share of a stage is done, from 0 to 1; None if nobody knows."""
+        stage = _STAGES.get(label, label)
+        self._session.report(stage, share)
+        if stage != self._stage:
+            self._stage = stage
+            click.echo(f"jaxprt: {stage}", err=True)
+
+
+def prepare(session: Session, chosen: SimpleNamespace) -> None:
+    """Reads files and precomputes their scene by each system, while the session shows what there is so far."""
+    report, began = Report(session), time.perf_counter()
+    report(f"reading {', '.join(path.name for path in chosen.files) or 'the embedded scene'}")
+    # `precompute` divides the meshes, after a preview without division.
+    scene = inputs.scene(SimpleNamespace(**vars(chosen) | {"refine": False}), playable=True)
+    lights = inputs.lights(chosen)
+    refine = bool(inputs.split_files(chosen.files)[0]) and chosen.refine
+    recipes = {
+        {"lobe": f"{getattr(recipe, 'lobes', 0)} lobes", "harmonic": "harmonics"}.get(system, name): (system, recipe)
+        for system in chosen.system
+        for name, recipe in options.recipes(system, chosen, lobes=LOBES).items()
+    }
+    report("evaluating materials")
+    first, (_, recipe) = next(iter(recipes.items()))
+    session.show_unshadowed(Unshadowed.of(scene, recipe), name=first, environments=lights)
+    systems: dict[str, RelitScene] = {}
+    for title, (system, recipe) in recipes.items():
+
+        def preview(relit: RelitScene, title: str = title) -> None:
+            session.show({title: relit}, preview=True)
+
+        # A folder is shared by systems with any number of lobes.
+        path = None if chosen.output is None else chosen.output / system
+        options_ = {"refine": refine, "preview": None if systems else preview, "progress": report}
+        systems[title] = precompute_scene(scene, lights, recipe, chosen.bounces, path, **options_)
+        # The lights are those of the session, because files may have been dropped on it.
+        session.show(systems, preview=len(systems) < len(recipes))
+    vertices = len(next(iter(systems.values())).mesh.position)
+    click.echo(f"jaxprt: ready after {time.perf_counter() - began:.1f} s, {vertices:,} vertices", err=True)
 
 
 def precompute_scene(
-    scene: Scene, lights: dict[str, Environment], recipe: Any, bounces: int | str, path: Path | None
+    scene: Scene, lights: dict[str, Environment], recipe: Any, bounces: int | str, path: Path | None, **more: Any
 ) -> RelitScene:
-    """The scene, precomputed by one recipe."""
-    return precompute(
-        scene,
-        system=recipe,
-        bounces=bounces,
-        refine=False,
-        size=next(iter(lights.values())).radiance.shape[-2],
-        path=path,
-        progress=sys.stderr.isatty(),
-    )
+    """The scene, precomputed by one recipe. Its meshes are not divided, unless `refine` says so."""
+    size = next(iter(lights.values())).radiance.shape[-2]
+    chosen = {"refine": False, "progress": sys.stderr.isatty(), **more}
+    return precompute(scene, system=recipe, bounces=bounces, size=size, path=path, **chosen)

@@ -140,7 +140,7 @@ class StoredFunction:
         functools.update_wrapper(self, function)
         self._function, self._compiled, self._static = function, compiled, static
         self._executables: dict[Any, Any] = {}
-        self._lock = threading.RLock()
+        self._locks: dict[Any, Any] = {}  # a lock for each signature
         _functions.append(self)
 
     def __call__(self, *argument: PyTree, **named: Any) -> PyTree:
@@ -159,7 +159,8 @@ class StoredFunction:
         except TypeError:  # a static value that has no hash: JAX says so
             return self._compiled(*argument, **named)
         if executable is None:
-            with self._lock:
+            # A call waits for its program alone, and not for those of other shapes that are being compiled.
+            with self._locks.setdefault(signature, threading.RLock()):
                 executable = self._executables.get(signature)
                 if executable is None:
                     executable = self._executables[signature] = self._executable(operand, option, tree, aval)

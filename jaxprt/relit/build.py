@@ -3,8 +3,9 @@
 import dataclasses
 import os
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from typing import Any
 
 import filelock
 import numpy as np
@@ -21,11 +22,14 @@ from jaxprt.relit.recipes import Recipe, Target, check
 from jaxprt.relit.scene import RAYS, RelitScene
 from jaxprt.scene import Environment, Part, Scene, sides
 from jaxprt.scene.scene import centered, default_camera
+from jaxprt.systems.bounces import GroupBounces
 from jaxprt.systems.protocol import System
 from jaxprt.visibility import Run, UnfinishedError
-from jaxprt.visibility.blocks import fingerprint
+from jaxprt.visibility.blocks import Progress, fingerprint
 
 _MOST = 1 << 13  # texels along the edge of a face
+_SIZE = 64  # texels along the edge of a face of the light, without a plan
+_COARSE = 16  # rays along the edge of a face in a preview: 768 above the horizon of a vertex
 
 
 @promoted
@@ -43,7 +47,8 @@ def precompute(
     size: int | None = None,
     path: str | os.PathLike | None = None,
     executor: Executor | None = None,
-    progress: bool = True,
+    progress: Progress = True,
+    preview: Callable[[RelitScene], None] | None = None,
 ) -> RelitScene:
     """Precomputes a scene for relighting: traces visibility at its vertices and fits the BRDFs of its parts.
 
@@ -85,7 +90,14 @@ def precompute(
             `jaxprt.visibility.Shard` computes only its share of the blocks, for machines that have nothing in common
             but `path`. A `ProcessPoolExecutor` must have the context "spawn", since forked processes hang where JAX
             runs.
-        progress: Whether to show progress bars.
+        progress: Whether to show progress bars. A function is called in place of them, with the name of the work, such
+            as "refine" or "visibility", and the share that is done, from 0 to 1. An error that it raises ends the call.
+        preview: Function that is called with scenes of less quality, in this thread, as soon as they exist. The first
+            has coarse visibility, from 768 rays, at the vertices before division. The next has coarse
+            visibility at all vertices. With bounces, the last has everything except bounces. They take the same lights,
+            eyes and materials as the result, which does not depend on `preview`. Coarse previews are left out where
+            they would take long, because a BRDF has to be fitted or a system factored, and where `path` holds finished
+            work.
 
     Returns:
         The precomputed scene, with the methods `radiance` and `picture`. A warning names parts that the scene's camera
@@ -111,6 +123,12 @@ def precompute(
         if folder.exists() and not folder.is_dir():
             raise NotADirectoryError(f"path must name a folder, got the file {folder}")
         folder.mkdir(parents=True, exist_ok=True)
+    coarse = None
+    if preview is not None and recipes is not None:
+        coarse = _coarse(scene, recipes, size or _SIZE, folder, progress, rays=rays, copied=copied)
+        if coarse is not None:
+            preview(coarse)
+    before = scene
     scene, divided = refinement.divided(
         scene, refine, vertices=vertices, environments=environments, folder=folder, progress=progress
     )
@@ -118,28 +136,94 @@ def precompute(
         wanted = _planned(scene, folder, environments=environments, error=error, rate=rate, progress=progress)
         recipes, size = _recipes(wanted.recipes, scene), wanted.size if size is None else size
         bounces = wanted.bounces if bounces is None else bounces
-    size = 64 if size is None else size
+    size = _SIZE if size is None else size
+    fields = {"rays": rays, "division": divided, "copied": copied}
+    if preview is not None and scene is not before and coarse is not None:
+        coarse = _coarse(scene, recipes, size, folder, progress, **fields)
+        if coarse is not None:
+            preview(coarse)
     near = centered(scene)
-    shadings = shaded(near.parts, recipes)
-    scene = dataclasses.replace(scene, parts=list(map(channels.as_shaded, scene.parts, shadings)))
-    mesh, whole = near.mesh, scene.mesh
-    warn.of_gain(near, shadings)
-    warn.of_shells(near)
-    warn.of_backs(scene, whole, default_camera(scene, whole))
-    parts = groups.kinds(shadings, recipes)
-    place = groups.Place.of(scene.counts, parts, [recipes[members[0]].joins for members in parts])
-    names = [_file_name(members, scene) for members in place.parts]
-    targets = [Target(mesh, size=size, run=run.within(name)) for name in names]
-    systems = _systems(recipes, shadings, targets, place)
-    lit = lamps.make(near, shadings, place, systems, targets, scene.point_lights)
-    reflected = None
-    if bounces:
-        # One store serves any number of bounces: a larger number resumes from a smaller one.
-        target = Target(mesh, size=size, run=run.within("scene"))
-        lamp = lit and lit.transport(place)
-        reflected = reflection.make(shadings, place, bounces, target, lamp=lamp, systems=systems if rays else None)
-    fields = {"lamps": lit, "rays": rays, "division": divided, "copied": copied}
-    return RelitScene(scene, shadings, place, systems, reflected, **fields)
+    traced = _Traced.of(scene, near, shaded(near.parts, recipes), recipes, size, run)
+    traced.warn()
+    direct = traced.relit(**fields)
+    if not bounces:
+        return direct
+    if preview is not None:
+        preview(direct)
+    # One store serves any number of bounces: a larger number resumes from a smaller one.
+    target = Target(traced.near.mesh, size=size, run=run.within("scene"))
+    return traced.relit(traced.reflected(bounces, target, rays=rays), **fields)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Traced:
+    """Direct light of a scene.
+
+    Attributes:
+        scene: The scene, with the materials that its systems show.
+        near: The scene with its origin at zero.
+        shadings: Mesh, BRDF and weights of each part.
+        place: Where the vertices of the parts stand in the groups.
+        systems: The system of each group.
+        lamps: Emitting parts and point lights; None without.
+    """
+
+    scene: Scene
+    near: Scene
+    shadings: list[Shading]
+    place: groups.Place
+    systems: list[System]
+    lamps: lamps.SceneLamps | None
+
+    @classmethod
+    def of(
+        cls, scene: Scene, near: Scene, shadings: list[Shading], recipes: Sequence[Recipe], size: int, run: Run
+    ) -> "_Traced":
+        """Traces the rays of a scene."""
+        scene = dataclasses.replace(scene, parts=list(map(channels.as_shaded, scene.parts, shadings)))
+        parts = groups.kinds(shadings, recipes)
+        place = groups.Place.of(scene.counts, parts, [recipes[members[0]].joins for members in parts])
+        names = [_file_name(members, scene) for members in place.parts]
+        targets = [Target(near.mesh, size=size, run=run.within(name)) for name in names]
+        systems = _systems(recipes, shadings, targets, place)
+        lit = lamps.make(near, shadings, place, systems, targets, scene.point_lights)
+        return cls(scene, near, shadings, place, systems, lit)
+
+    def warn(self) -> None:
+        """Warns of scenes that look wrong although they are drawn as asked."""
+        warn.of_gain(self.near, self.shadings)
+        warn.of_shells(self.near)
+        mesh = self.scene.mesh
+        warn.of_backs(self.scene, mesh, default_camera(self.scene, mesh))
+
+    def reflected(self, bounces: int | str, target: Target, *, rays: int) -> GroupBounces:
+        """Light that the parts reflect onto each other."""
+        lamp, systems = self.lamps and self.lamps.transport(self.place), self.systems if rays else None
+        return reflection.make(self.shadings, self.place, bounces, target, lamp=lamp, systems=systems)
+
+    def relit(self, reflected: GroupBounces | None = None, **fields: Any) -> RelitScene:
+        """The relit scene."""
+        return RelitScene(self.scene, self.shadings, self.place, self.systems, reflected, lamps=self.lamps, **fields)
+
+
+def _coarse(
+    scene: Scene,
+    recipes: Sequence[Recipe],
+    size: int,
+    folder: pathlib.Path | None,
+    progress: Progress,
+    **fields: Any,
+) -> RelitScene | None:
+    """The scene by few rays. None if it would take long, or if the folder has results of rays."""
+    simple = [coarse for recipe in recipes if (coarse := recipe.coarse()) is not None]
+    if len(simple) < len(recipes) or (folder is not None and any(folder.glob("*/*.prt"))):
+        return None
+    near = centered(scene)
+    shadings = shaded(near.parts, simple)
+    if any(shading.table is None and not shading.matte for shading in shadings):
+        return None
+    run = Run(progress=callable(progress) and progress, texels=_COARSE)
+    return _Traced.of(scene, near, shadings, simple, size, run).relit(**fields)
 
 
 def shaded(parts: Sequence[Part], recipes: Sequence[Recipe]) -> list[Shading]:

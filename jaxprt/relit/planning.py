@@ -15,7 +15,6 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import numpy as np
-import tqdm
 from jaxtyping import Float
 
 from jaxprt import require
@@ -127,7 +126,7 @@ def plan(
     rate: float = 30.0,
     refine: bool | float = True,
     path: str | os.PathLike | None = None,
-    progress: bool = True,
+    progress: blocks.Progress = True,
 ) -> Plan:
     """Chooses a system for each part of a scene: the one with the fewest bytes that meets an error and a frame rate.
 
@@ -149,7 +148,7 @@ def plan(
         rate: Frames per second for the whole scene, each with a new light and a new view, without rasterization.
         refine: Whether meshes are divided first, and to which error, as in `jaxprt.precompute`.
         path: Folder in which measurements are stored. A call that was interrupted resumes from there.
-        progress: Whether to show a progress bar.
+        progress: Whether to show a progress bar, or a function; see `jaxprt.Run`.
 
     Returns:
         The plan, for `jaxprt.precompute(scene, system=plan.recipes, bounces=plan.bounces)`.
@@ -172,7 +171,7 @@ def plan(
     looks = channels.looks(scene.parts)
     shadings = [channels.of_part(part, look=look) for part, look in zip(scene.parts, looks, strict=True)]
     parts = groups.kinds(shadings, [Lobes()] * len(shadings))
-    for number, group in enumerate(tqdm.tqdm(parts, desc="plan", unit="group", disable=not progress)):
+    for number, group in enumerate(blocks.tracked(parts, progress, "plan", unit="group")):
         members, names = [scene.parts[part] for part in group], tuple(scene.names[part] for part in group)
         sample = Sample.make(members, [shadings[part] for part in group], mesh, total, size, environments, views)
         count = len(sample.shading.mesh.position)

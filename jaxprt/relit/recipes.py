@@ -100,6 +100,10 @@ class Recipe(eqx.Module):
                 the mesh's. `jaxprt.systems.axes.pad` pads transport.
         """
 
+    def coarse(self) -> "Recipe | None":
+        """The recipe of a preview, which takes little longer than its rays; None if there is none."""
+        return None
+
     def takes(self, table: StandardTable) -> bool:
         """Whether the system reads a standard table; otherwise parts have BRDFs of their own."""
         return False
@@ -131,6 +135,10 @@ class Lobes(Recipe):
 
     lobes: int = 12
     texels: int = 16
+
+    def coarse(self) -> Recipe:
+        """The recipe itself."""
+        return self
 
     def takes(self, table: StandardTable) -> bool:
         """Whether a table with this number of lobes is shipped."""
@@ -169,6 +177,10 @@ class Harmonics(Recipe):
 
     degree: int = 4
     laplacian: float = 1.0
+
+    def coarse(self) -> Recipe:
+        """The recipe itself."""
+        return self
 
     def takes(self, table: StandardTable) -> bool:
         """Whether a table of this degree is shipped."""
@@ -325,6 +337,10 @@ class Dynamic(Recipe):
         for name in ("components", "modes", "keep"):
             require.count(name, getattr(self, name), least=1)
         require.count("texels", self.texels, least=0)
+
+    def coarse(self) -> Recipe | None:
+        """The same lobes without the tensor."""
+        return Lobes(self.lobes, self.texels) if self.lobes else None
 
     def takes(self, table: StandardTable) -> bool:
         """Whether tables with this number of lobes and these ranks are shipped."""

@@ -53,7 +53,7 @@ def refine(
     error: float = 0.02,
     vertices: int = 100_000,
     environments: Sequence[Environment] | None = None,
-    progress: bool = True,
+    progress: blocks.Progress = True,
 ) -> Scene:
     """Subdivides triangles where shadows vary between vertices. Call it before `jaxprt.precompute`.
 
@@ -70,7 +70,7 @@ def refine(
             unchanged.
         environments: Environments under which the error must hold. If None, light with the power spectrum of natural
             scenes, from any direction. Sharp shadows of a sun require the environment that contains it.
-        progress: Whether to show a progress bar.
+        progress: Whether to show a progress bar, or a function; see `jaxprt.Run`.
 
     Returns:
         The scene with the same surfaces, images and materials, and more vertices.
@@ -95,7 +95,7 @@ def divided(
     vertices: int | None,
     environments: Sequence[Environment] | None,
     folder: pathlib.Path | None,
-    progress: bool,
+    progress: blocks.Progress,
 ) -> tuple[Scene, MeshDivision | None]:
     """A scene divided as `jaxprt.precompute` asks for, and how; None if it stays as it is.
 
@@ -105,7 +105,7 @@ def divided(
         vertices: Largest number of vertices; None for the default.
         environments: Lights, as in `refine`. Their brightest texels do not count, because pictures trace their shadows.
         folder: Folder in which the division is stored.
-        progress: Whether to show a progress bar.
+        progress: Whether to show a progress bar, or a function; see `jaxprt.Run`.
 
     Raises:
         TypeError: `wanted` is neither a number nor a truth value.

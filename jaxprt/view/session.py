@@ -10,7 +10,7 @@ import time
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -26,10 +26,12 @@ from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, load_environment, sides
 from jaxprt.scene.mesh import bounds
 from jaxprt.view import messages, stages
-from jaxprt.view.content import light_texels, mip_edges, page_content
+from jaxprt.view.content import light_texels, mip_edges, page_content, unshadowed_content
 from jaxprt.view.messages import Lamp, Look, Reply
+from jaxprt.view.progress import EndedError, Progress, yield_cores
 from jaxprt.view.reduced import PageScene
 from jaxprt.view.stages import Stages
+from jaxprt.view.unshadowed import Unshadowed
 
 _LARGEST = 2048.0  # most pixels along an edge of a picture
 _PICTURE = 480, 360  # columns and rows of the picture that a saved notebook keeps
@@ -46,24 +48,92 @@ class _LateError(Exception):
     """The viewer that requested a picture has sent a newer look."""
 
 
+class _Version(NamedTuple):
+    """A scene that a session shows.
+
+    Attributes:
+        number: Number of scenes that the session has shown, this one included.
+        stages: Lights, materials and views of the scene.
+        preview: Whether a better scene follows.
+    """
+
+    number: int
+    stages: Stages
+    preview: bool
+
+
 class Session:
     """State of the viewer and its answers to messages, for notebooks and browsers alike.
 
     There is no queue, because the browser requests one look at a time. Looks are answered while full-quality pictures
     are being computed. A picture is abandoned between two of its steps when the same viewer has sent a newer look.
 
+    A session may start without a scene: `prepare` computes scenes in a thread, the page shows what is being done, and
+    `show` replaces the scene by a better one, while camera, light and materials stay.
+
     Attributes:
-        stages: Lights, materials and views.
+        progress: What is being prepared.
     """
 
     def __init__(
-        self, systems: RelitScene | Mapping[str, RelitScene], *, environments: Mapping[str, Environment] | None = None
+        self,
+        systems: RelitScene | Mapping[str, RelitScene] | None = None,
+        *,
+        environments: Mapping[str, Environment] | None = None,
     ):
-        """Checks that all systems have the same scene and all lights the same size.
+        """Starts with a scene, or without one for `prepare`.
+
+        Args:
+            systems: A relit scene, or a dictionary from names to several systems of one scene; None for none yet.
+            environments: Dictionary from names to lights; the scene's own or the two embedded ones if None.
+
+        Raises:
+            TypeError: `show` says when.
+            ValueError: `show` says when.
+        """
+        self.progress = Progress()
+        self._lock = threading.Lock()
+        self._newest: OrderedDict[str, int] = OrderedDict()  # sequence number of the newest look of each viewer
+        self._ended = False
+        self._version: _Version | None = None
+        self._size = _PICTURE  # columns and rows of the pictures of the page
+        if systems is not None:
+            self.show(systems, environments=environments)
+            self.progress.finish()
+
+    @property
+    def stages(self) -> Stages:
+        """Lights, materials and views of the scene that is shown.
+
+        Raises:
+            ValueError: There is no scene yet.
+        """
+        return self._shown().stages
+
+    @property
+    def version(self) -> int:
+        """Number of scenes that the session has shown, each better than the one before."""
+        return 0 if self._version is None else self._version.number
+
+    def _shown(self) -> _Version:
+        if self._version is None:
+            raise ValueError("the viewer must have a scene, and is still preparing it")
+        return self._version
+
+    def show(
+        self,
+        systems: RelitScene | Mapping[str, RelitScene],
+        *,
+        environments: Mapping[str, Environment] | None = None,
+        preview: bool = False,
+    ) -> None:
+        """Shows a scene in place of the one before. All systems must have the same scene and all lights the same size.
 
         Args:
             systems: A relit scene, or a dictionary from names to several systems of one scene.
-            environments: Dictionary from names to lights; the scene's own or the two embedded ones if None.
+            environments: Dictionary from names to lights. If None, the lights of the scene before, with those that were
+                dropped on the viewer; for the first scene its own lights, or the two embedded ones.
+            preview: Whether a better scene follows. A preview has no full-quality pictures.
 
         Raises:
             TypeError: A system is not a relit scene, or a light is not an `Environment`.
@@ -85,15 +155,70 @@ class Session:
         for name, system in by_name.items():
             if [(part.name, part.mesh.position.shape) for part in system.scene.parts] != shape:
                 raise ValueError(f"systems must be of the same scene, got another scene for {name!r}")
-        lights = _name_lights(lights_of(scene.scene)) if environments is None else dict(environments)
-        _check_lights(lights)
-        self.stages = Stages(by_name, lights)
-        self._lock = threading.Lock()
-        self._newest: OrderedDict[str, int] = OrderedDict()  # sequence number of the newest look of each viewer
-        self._ended = False
+        lights = environments
+        if lights is None and self._version is None:
+            lights = _name_lights(lights_of(scene.scene))
+        if lights is not None:
+            _check_lights(lights)
+        self._replace(by_name, lights, preview=preview)
+
+    def show_unshadowed(self, scene: Unshadowed, *, name: str, environments: Mapping[str, Environment]) -> None:
+        """Shows a scene before its rays are traced. A page can show it if its GPU shades pixels.
+
+        Args:
+            scene: The scene.
+            name: Name of the first system that it will have.
+            environments: Dictionary from names to lights.
+
+        Raises:
+            TypeError: A light is not an `Environment`.
+            ValueError: There is no light, or the lights have different sizes.
+        """
+        _check_lights(environments)
+        self._replace({name: scene}, environments, preview=True)
+
+    def _replace(self, systems: Any, environments: Mapping[str, Environment] | None, *, preview: bool) -> None:
+        new = Stages(systems, environments or {})
+        with self._lock:
+            old = self._version
+            if environments is None and old is not None:
+                new.name, new.lights = old.stages.name, old.stages.lights
+            self._version = _Version(1 if old is None else old.number + 1, new, preview)
+
+    def prepare(self, make: Callable[[], None]) -> None:
+        """Computes the scene in a thread. Programs that the first changes need are compiled after it.
+
+        Args:
+            make: Function that calls `report` and `show`. An error that it raises is told to the page, and `wait`
+                raises it.
+        """
+        threading.Thread(target=self._prepare, args=(make,), name="jaxprt-prepare", daemon=True).start()
+
+    def _prepare(self, make: Callable[[], None]) -> None:
+        yield_cores()
+        try:
+            make()
+            self.progress.prepared()
+            for share in self.stages.rehearsal(*self._size) if self.version else ():
+                self.report("compiling programs for changes", share)
+        except EndedError:
+            pass
+        except BaseException as error:
+            self.progress.fail(error)
+        self.progress.finish()
+
+    def report(self, stage: str, share: float | None) -> None:
+        """Tells the page what is being done, and which share of it is done; None if nobody knows.
+
+        Raises:
+            EndedError: The session has ended.
+        """
+        if self._ended:
+            raise EndedError
+        self.progress.report(stage, share)
 
     def end(self) -> None:
-        """Abandons the pictures that are being computed, because nobody waits for them any more."""
+        """Abandons what is being computed, because nobody waits for it any more."""
         self._ended = True
 
     def answer(self, message: Mapping[str, Any], buffers: Sequence[bytes] = ()) -> Reply:
@@ -107,6 +232,7 @@ class Session:
             "sky": self._sky,
             "drop": self._drop,
             "page": self._page,
+            "progress": self._progress,
         }
         kind = message.get("kind")
         kind = kind if isinstance(kind, str) else type(kind).__name__
@@ -124,10 +250,11 @@ class Session:
     def picture(self) -> Float[np.ndarray, "h w 3"]:
         """The first picture of the viewer, from vertex radiance, encoded for display."""
         scene = self.stages.scene
+        assert isinstance(scene, RelitScene)
         camera = dataclasses.replace(scene.camera, width=_PICTURE[0], height=_PICTURE[1])
         color = scene.radiance(self.stages.lights[0], eye=camera.eye)
         behind = sky(self.stages.lights[0], camera)
-        mesh = seen_from_front(scene.mesh, camera, self._hidden_faces())
+        mesh = seen_from_front(scene.mesh, camera, _hidden_faces(scene))
         return np.asarray(display(render(mesh, color, camera, background=behind)))
 
     def sky(self, number: int, lamps: tuple[Lamp, ...] = (), *, rows: int) -> Reply:
@@ -137,13 +264,20 @@ class Session:
         data, scale = messages.encode(np.concatenate([level.reshape(-1, 3) for level in levels]), stops=None)
         return Reply({"kind": "sky", "scale": scale, "width": width, "height": height, "levels": len(levels)}, [data])
 
-    def _hidden_faces(self) -> Bool[np.ndarray, " f"]:
-        """Triangles that cameras do not see from behind."""
-        mesh = self.stages.scene.mesh
-        return sides.hidden_backs(self.stages.scene.scene)[np.asarray(mesh.region)[np.asarray(mesh.face)[:, 0]]]
+    def _progress(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+        """What is being prepared, and the number of scenes so far. It grows when there is a better scene.
+
+        A page says how large its pictures are, so that their programs can be compiled ahead.
+        """
+        if "width" in message:
+            self._size = _size(message)[:2]
+        return Reply(self.progress.content() | {"version": self.version}, [])
 
     def _scene(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
-        scene = self.stages.scene
+        if self._version is None:
+            return self._progress(message, buffers)
+        number, shown, preview = self._version
+        scene = shown.scene
         mesh, low, high = scene.mesh, *bounds(scene.mesh)
         parts = [
             {"name": part.name, "vertices": len(part.mesh.position), "free": stages.freedom(shading, part.material)}
@@ -152,10 +286,12 @@ class Session:
         camera = scene.camera
         content = {
             "kind": "scene",
+            "version": number,
+            "finished": self.progress.finished,
             "parts": parts,
-            "lights": self.stages.name,
-            "systems": {name: {"bounces": system.bounces is not None} for name, system in self.stages.systems.items()},
-            "rests": ["still", "exact", "picture"],
+            "lights": shown.name,
+            "systems": {name: {"bounces": system.bounces is not None} for name, system in shown.systems.items()},
+            "rests": [] if preview else ["still", "exact", "picture"],
             "vertices": len(mesh.position),
             "triangles": len(mesh.face),
             "center": ((low + high) / 2).tolist(),
@@ -164,7 +300,7 @@ class Session:
             "target": np.asarray(camera.target, float).tolist(),
             "field_of_view": float(camera.field_of_view),
         }
-        hidden, face = self._hidden_faces(), stages.counterclockwise(mesh)
+        hidden, face = _hidden_faces(scene), stages.counterclockwise(mesh)
         # Those with black backs come first: of the others the viewer draws no backs.
         content["backs"] = int(np.count_nonzero(~hidden))
         arrays = np.asarray(mesh.position, "<f4"), face[np.argsort(hidden, kind="stable")]
@@ -172,30 +308,39 @@ class Session:
 
     def _page(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         """What the browser's GPU shades pixels from, or why it cannot."""
-        name = messages.system(message, list(self.stages.systems))
+        shown = self.stages
+        name = messages.system(message, list(shown.systems))
+        system: RelitScene | Unshadowed = shown.systems[name]
         try:
-            content, arrays = page_content(PageScene.for_gpu(self.stages.systems[name]), self.stages.lights)
+            if isinstance(system, Unshadowed):
+                content, arrays = unshadowed_content(system.scene.parts, system.shading, shown.lights)
+            else:
+                content, arrays = page_content(PageScene.for_gpu(system), shown.lights)
         except ValueError as error:
             return Reply({"kind": "page", "system": name, "missing": str(error)}, [])
         return Reply(content | {"kind": "page", "system": name}, arrays)
 
-    def _parse(self, message: Mapping[str, Any]) -> tuple[Look, int]:
-        look = messages.look(message, systems=list(self.stages.systems), lights=len(self.stages.lights))
-        return look, int(messages.number(message, "seq", 0.0, 2.0**53))
+    def _parse(self, message: Mapping[str, Any]) -> tuple[Stages, Look, int]:
+        """The scene that is shown, the look of a message, and its number. It is late if the page has another scene."""
+        shown = self._shown()
+        if "version" in message and messages.number(message, "version", 0.0, 2.0**53) != shown.number:
+            raise _LateError
+        look = messages.look(message, systems=list(shown.stages.systems), lights=len(shown.stages.lights))
+        return shown.stages, look, int(messages.number(message, "seq", 0.0, 2.0**53))
 
     def _look(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
-        look, seq = self._parse(message)
+        shown, look, seq = self._parse(message)
         viewer = _viewer(message)
         with self._lock:
             self._newest[viewer] = max(self._newest.pop(viewer, 0), seq)
             while len(self._newest) > _VIEWERS:
                 self._newest.popitem(last=False)
         began = time.perf_counter()
-        self.stages.light_side(look)
+        shown.light_side(look)
         lit = time.perf_counter()
-        self.stages.view_side(look)
+        shown.view_side(look)
         viewed = time.perf_counter()
-        color, which = self.stages.color(look), self._which(message, look)
+        color, which = shown.color(look), _which(message, look, shown)
         data, scale = messages.encode(
             color if which is None else color[which], stops=_stops(message), tone=_tone(message)
         )
@@ -205,23 +350,13 @@ class Session:
         content = {"kind": "color", "seq": seq, "scale": scale, "ms": times}
         return Reply(content, [data] if which is None else [data, np.packbits(which).tobytes()])
 
-    def _which(self, message: Mapping[str, Any], look: Look) -> Bool[np.ndarray, " v"] | None:
-        """Mask of the vertices that a message requests: those that face the eye, or the others; None for all."""
-        asked = message.get("vertices", "all")
-        if asked not in ("all", "seen", "unseen"):
-            raise ValueError(f"vertices must be all, seen or unseen, got {str(asked)[:80]!r}")
-        if asked == "all":
-            return None
-        seen = self.stages.facing(look)
-        return seen if asked == "seen" else ~seen
-
     def _still(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
-        look, seq = self._parse(message)
+        shown, look, seq = self._parse(message)
         width, height, coarse = _size(message)
-        began, between = time.perf_counter(), self._between(message, seq)
+        began, between = time.perf_counter(), self._between(message, seq, shown)
         between()
         clear = messages.truth(message, "transparent")
-        make = self.stages.cutout if clear else self.stages.picture
+        make = shown.cutout if clear else shown.picture
         picture = make(look, width, height, samples=1 if coarse else 4, between=between)
         data, scale = messages.encode(picture[..., :3], stops=_stops(message), tone=_tone(message))
         alpha = [zlib.compress(np.round(255 * picture[..., 3]).astype(np.uint8).tobytes(), 1)] if clear else []
@@ -231,16 +366,16 @@ class Session:
 
     def _exact(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         """The exact picture under direct light of the environment, and the relit picture's error at some pixels."""
-        look, seq = self._parse(message)
+        shown, look, seq = self._parse(message)
         width, height, coarse = _size(message)
-        between = self._between(message, seq)
+        between = self._between(message, seq, shown)
         between()
-        scene, camera = self.stages.changed_scene(look), stages.camera(look, width, height)
-        arguments = scene, [of_part(part) for part in scene.parts], [self.stages.environment(look)], camera
+        scene, camera = shown.changed_scene(look), stages.camera(look, width, height)
+        arguments = scene, [of_part(part) for part in scene.parts], [shown.environment(look)], camera
         told = {}
         if not coarse:
             pixels = exact.exact_pixels(*arguments, pixels=_PIXELS, between=between)
-            error, spread = pixels.relative_l2(self.stages.direct_picture(look, width, height, between=between))
+            error, spread = pixels.relative_l2(shown.direct_picture(look, width, height, between=between))
             told = {"error": error, "spread": spread} if np.isfinite([error, spread]).all() else {}
         truth = exact.exact_picture(*arguments, between=between)
         data, scale = messages.encode(truth.color[0], stops=_stops(message), tone=_tone(message))
@@ -249,18 +384,18 @@ class Session:
 
     def _picture(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         """A PNG file of a picture of any size. Newer looks do not abandon it."""
-        look, _ = self._parse(message)
+        shown, look, _ = self._parse(message)
         width, height = (int(messages.number(message, key, 1.0, _LARGEST_FILE)) for key in ("width", "height"))
         if width * height > _MOST_PIXELS:
             raise ValueError(f"a picture must have at most {_MOST_PIXELS} pixels, got {width} x {height}")
         options = {"samples": 16 if width * height <= _FINE_PIXELS else 4, "between": self._until_ended}
         clear = messages.truth(message, "transparent")
-        picture = (self.stages.cutout if clear else self.stages.picture)(look, width, height, **options)
+        picture = (shown.cutout if clear else shown.picture)(look, width, height, **options)
         exposure = {"stops": _stops(message) or 0.0, "tone": _tone(message)}
-        shown = [messages.displayed(picture[..., :3], **exposure), picture[..., 3:]]
+        pixels = [messages.displayed(picture[..., :3], **exposure), picture[..., 3:]]
         with tempfile.TemporaryDirectory() as folder:
             path = pathlib.Path(folder) / "picture.png"
-            files.write_png(path, np.concatenate(shown, -1))
+            files.write_png(path, np.concatenate(pixels, -1))
             return Reply({"kind": "picture", "width": width, "height": height}, [path.read_bytes()])
 
     def _until_ended(self) -> None:
@@ -269,7 +404,7 @@ class Session:
 
     def _sky(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         """Pictures of a light before rotation, each of half as many rows as the one before."""
-        look, seq = self._parse(message)
+        _, look, seq = self._parse(message)
         rows = int(messages.number(message, "rows", 1.0, _SKY_ROWS)) if "rows" in message else 1
         reply = self.sky(look.light, look.lamps, rows=rows)
         return Reply(reply.content | {"seq": seq}, reply.buffers)
@@ -299,17 +434,33 @@ class Session:
             content = {"kind": "lights", "lights": list(self.stages.name), "light": len(self.stages.name) - 1}
             return Reply(content, [texels])
 
-    def _between(self, message: Mapping[str, Any], seq: int) -> Callable[[], None]:
-        """A function to call between the steps of a picture. It raises if the viewer has sent a newer look."""
+    def _between(self, message: Mapping[str, Any], seq: int, shown: Stages) -> Callable[[], None]:
+        """A function to call between the steps of a picture. It raises if there is a newer look or a better scene."""
         viewer = _viewer(message)
 
         def between() -> None:
             with self._lock:
-                late = self._ended or seq < self._newest.get(viewer, 0)
+                late = self._ended or seq < self._newest.get(viewer, 0) or self.stages is not shown
             if late:
                 raise _LateError
 
         return between
+
+
+def _hidden_faces(scene: RelitScene | Unshadowed) -> Bool[np.ndarray, " f"]:
+    """Triangles that cameras do not see from behind."""
+    return sides.hidden_backs(scene.scene)[np.asarray(scene.mesh.region)[np.asarray(scene.mesh.face)[:, 0]]]
+
+
+def _which(message: Mapping[str, Any], look: Look, shown: Stages) -> Bool[np.ndarray, " v"] | None:
+    """Mask of the vertices that a message requests: those that face the eye, or the others; None for all."""
+    asked = message.get("vertices", "all")
+    if asked not in ("all", "seen", "unseen"):
+        raise ValueError(f"vertices must be all, seen or unseen, got {str(asked)[:80]!r}")
+    if asked == "all":
+        return None
+    seen = shown.facing(look)
+    return seen if asked == "seen" else ~seen
 
 
 def _viewer(message: Mapping[str, Any]) -> str:
@@ -321,7 +472,7 @@ def _size(message: Mapping[str, Any]) -> tuple[int, int, bool]:
     """Width and height of the picture that a message requests, and whether it is a coarse one, which is smaller."""
     width, height = (int(messages.number(message, key, 1.0, _LARGEST)) for key in ("width", "height"))
     coarse = messages.truth(message, "coarse")
-    step = _COARSE[message["kind"]] if coarse else 1
+    step = _COARSE.get(message["kind"], 1) if coarse else 1
     return max(width // step, 1), max(height // step, 1), coarse
 
 

@@ -1,9 +1,10 @@
 """Stages of picture computation, each cached until its inputs change."""
 
 import dataclasses
+import math
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -19,9 +20,13 @@ from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
 from jaxprt.scene.environment import add_disk, rotate, sky
 from jaxprt.systems import standard
 from jaxprt.view.messages import Lamp, Look
+from jaxprt.view.unshadowed import Unshadowed
 
 _KEPT = 4  # cached results of each stage
 _SKY = 128  # height of the picture of an environment in pixels
+_TURN = 0.01  # radians, and share of the distance to the eye, by which rehearsed looks differ
+_VALUES = 4  # of roughness that are tried for their programs
+_PARTS = 8  # most parts whose materials are changed for their programs
 
 Made = TypeVar("Made")
 
@@ -30,12 +35,12 @@ class Stages:
     """Lights, materials, views and pictures of several systems of one scene. It is safe to share between threads.
 
     Attributes:
-        systems: Relit scene of each system, by name.
+        systems: Relit scene of each system, by name; before rays are traced, the scene without shadows.
         lights: Environments of equal size.
         name: Names of the lights.
     """
 
-    def __init__(self, systems: Mapping[str, RelitScene], environments: Mapping[str, Environment]):
+    def __init__(self, systems: Mapping[str, RelitScene | Unshadowed], environments: Mapping[str, Environment]):
         """Stores the systems and lights. More lights may be added later."""
         # The browser draws in float32: positions, eyes and targets are relative to the scene's origin.
         systems = {name: scene.centered() for name, scene in systems.items()}
@@ -46,8 +51,8 @@ class Stages:
         self._lock = threading.Lock()
 
     @property
-    def scene(self) -> RelitScene:
-        """The relit scene of the first system."""
+    def scene(self) -> RelitScene | Unshadowed:
+        """The scene of the first system."""
         return next(iter(self.systems.values()))
 
     @property
@@ -56,8 +61,15 @@ class Stages:
         return self.lights[0].radiance.shape[-2]
 
     def system(self, look: Look) -> RelitScene:
-        """The relit scene of the system that a look names."""
-        return (self.systems if look.bounces else self._bare)[look.system]
+        """The relit scene of the system that a look names.
+
+        Raises:
+            ValueError: No rays have been traced yet.
+        """
+        system = (self.systems if look.bounces else self._bare)[look.system]
+        if isinstance(system, Unshadowed):
+            raise ValueError("colors must have rays, which are still being traced")
+        return system
 
     def unturned(self, number: int, lamps: tuple[Lamp, ...]) -> Environment:
         """A light with the lamps added, before rotation."""
@@ -168,8 +180,47 @@ class Stages:
     def direct_picture(self, look: Look, width: int, height: int, *, between: Between) -> Float[np.ndarray, "h w 3"]:
         """The picture under direct light of the environment only."""
         arguments = self.environment(look), camera(look, width, height)
-        color = self._bare[look.system].picture(*arguments, materials=self.materials(look), between=between)
+        color = self.system(look._replace(bounces=False)).picture(
+            *arguments, materials=self.materials(look), between=between
+        )
         return np.broadcast_to(np.asarray(color), (height, width, 3))
+
+    def rehearsal(self, width: int, height: int) -> Iterator[float]:
+        """Computes what first changes of light, view and materials ask for, so that their programs are compiled.
+
+        Args:
+            width: Columns of a picture.
+            height: Rows of a picture.
+
+        Yields:
+            The share that is done, after each step.
+        """
+        looks = [look for name in self.systems for look in self._first_looks(name)]
+        for number, look in enumerate(looks):
+            self.color(look)
+            yield (number + 1) / (len(looks) + 1)
+        self.picture(looks[0], width, height)
+        yield 1.0
+
+    def _first_looks(self, name: str) -> Iterator[Look]:
+        """A look of a system, and looks in which one thing is changed."""
+        system = self.systems[name]
+        eye, target = (tuple(np.asarray(place, float).tolist()) for place in (system.camera.eye, system.camera.target))
+        angle, bounces = float(system.camera.field_of_view), system.bounces is not None
+        first = Look(name, 0, 0.0, (), eye, target, angle, bounces, ())
+        yield first
+        yield first._replace(turn=_TURN, eye=(eye[0] + _TURN * math.dist(eye, target), *eye[1:]))
+        pairs = zip(system.scene.parts, system.shading, strict=True)
+        for part, shading in sorted(pairs, key=lambda pair: -len(pair[0].mesh.position))[:_PARTS]:
+            values = freedom(shading, part.material) or {}
+            changed = {name: tuple(values[name]) for name in ("diffuse", "specular") if name in values}
+            changed |= {name: values[name] for name in ("f0",) if name in values}
+            # The number of points along the edges of bright texels, which is static, depends on them.
+            scales = [name for name in ("roughness", "exponent") if f"{name}_range" in values]
+            rows = [changed | {name: value} for name in scales for value in _between(values[f"{name}_range"])]
+            for row in rows or [changed]:
+                if row:
+                    yield first._replace(material=((part.name, tuple(sorted(row.items()))),))
 
     def changed_scene(self, look: Look) -> Scene:
         """The scene with the changed materials."""
@@ -190,6 +241,11 @@ class Stages:
             while len(results) > _KEPT:
                 results.popitem(last=False)
         return result
+
+
+def _between(ends: Sequence[float]) -> list[float]:
+    """Values from one end of a range to the other."""
+    return np.linspace(ends[0], ends[1], _VALUES).tolist()
 
 
 def counterclockwise(mesh: Mesh) -> UInt32[np.ndarray, "f 3"]:

@@ -28,8 +28,8 @@ _STYLE = """<style>
 class Viewer(anywidget.AnyWidget):
     """A viewer in a notebook cell.
 
-    Its own threads compute the answers, so that a full-quality picture blocks neither looks nor the kernel. At most one
-    full-quality picture is computed at a time.
+    Its own threads compute the answers, so that full-quality pictures and files block neither looks nor the kernel. At
+    most one full-quality picture is computed at a time.
 
     Attributes:
         session: The session that it shows.
@@ -43,12 +43,14 @@ class Viewer(anywidget.AnyWidget):
         """Makes a viewer of a session."""
         super().__init__(height=height)
         self.session = session
-        self._looks, self._rests = (ThreadPoolExecutor(1, thread_name_prefix="jaxprt-view") for _ in range(2))
+        self._looks, self._rests, self._files = (
+            ThreadPoolExecutor(1, thread_name_prefix="jaxprt-view") for _ in range(3)
+        )
         self.on_msg(self._heard)
 
     def close(self) -> None:
         """Removes the viewer from the notebook."""
-        for executor in (self._looks, self._rests):
+        for executor in (self._looks, self._rests, self._files):
             executor.shutdown(wait=False, cancel_futures=True)
         super().close()
 
@@ -73,7 +75,8 @@ class Viewer(anywidget.AnyWidget):
 
     def _heard(self, widget: Any, message: Any, buffers: Sequence[Any]) -> None:
         if isinstance(message, dict) and isinstance(message.get("content"), dict):
-            threads = self._rests if message["content"].get("kind") in ("still", "exact", "picture") else self._looks
+            kinds = {"still": self._rests, "exact": self._rests, "picture": self._rests, "drop": self._files}
+            threads = kinds.get(str(message["content"].get("kind")), self._looks)
             threads.submit(self._answer, message, [bytes(buffer) for buffer in buffers])
 
     def _answer(self, message: dict[str, Any], buffers: list[bytes]) -> None:

@@ -2,16 +2,18 @@
 
 import abc
 import collections
+import contextlib
 import hashlib
 import operator
 import os
 import pickle
 import queue
+import time
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import tqdm
@@ -23,6 +25,10 @@ from jaxprt.files.arrays import BlockStore, Layout
 
 _HELD = 1 << 28  # bytes of results, and of copies of a job, that may be in flight at once
 _MOST = 4096  # blocks that may be in flight at once
+_PAUSE = 0.1  # seconds between calls of a function that is told of progress
+
+Progress = bool | Callable[[str, float], None]  # see `Run.progress`
+Item = TypeVar("Item")
 
 
 class Job(abc.ABC):
@@ -60,6 +66,10 @@ class Job(abc.ABC):
     @abc.abstractmethod
     def run(self, block: int) -> tuple[Mapping[str, np.ndarray], int]:
         """Computes one block of every result array. Also returns the number of rays that it traced."""
+
+    def with_texels(self, texels: int) -> "Job":
+        """The job with fewer rays, as `Run.texels` says; the same job if it has no such choice."""
+        return self
 
 
 class Shard(ThreadPoolExecutor):
@@ -125,16 +135,23 @@ class Run:
         executor: A `concurrent.futures.Executor` that computes the blocks; if None, the cores of this machine.
             A `Shard` computes only its own blocks. A `ProcessPoolExecutor` must have the context "spawn" or
             "forkserver".
-        progress: Whether to show progress bars.
+        progress: Whether to show progress bars. A function is called in place of them, from the thread that waits for
+            the blocks, with the name of the work and the share of it that is done, from 0 to 1. If it raises an error,
+            the work ends with that error.
+        texels: Largest number of texels along the edge of a face for which rays are traced. Finer texels get the
+            visibility of the coarse texel that contains them, so a preview has the arrays of the whole result. If None,
+            all texels are traced, and those on a boundary of visibility by 16 more rays.
 
     Raises:
         TypeError: `path` is not a path, or `executor` has no method `submit`.
-        ValueError: `executor` forks this process, or is a `Shard` without a path.
+        ValueError: `executor` forks this process, or is a `Shard` without a path; or `texels` is below 1, or given
+            with a path, which stores whole results only.
     """
 
     path: str | os.PathLike | None = None
     executor: Executor | None = None
-    progress: bool = True
+    progress: Progress = True
+    texels: int | None = None
 
     def __post_init__(self):
         """Checks the path and the executor."""
@@ -147,6 +164,10 @@ class Run:
             raise ValueError(
                 f"part {part.number}/{part.count} must have a path, the folder that all parts share, got None"
             )
+        if self.texels is not None:
+            require.count("texels", self.texels, least=1)
+            if self.path is not None:
+                raise ValueError(f"texels must be None with a path, which stores whole results, got {self.texels}")
 
     def within(self, name: str) -> "Run":
         """The same, with a folder of this name inside of the folder."""
@@ -175,13 +196,14 @@ def compute(job: Job, run: Run, *, label: str = "precompute") -> dict[str, np.nd
         RuntimeError: A worker died; finished blocks are kept in the store.
     """
     executor = run.executor
+    job = job if run.texels is None else job.with_texels(run.texels)
     blocks = -(-job.vertices // job.step)
     part = executor if isinstance(executor, Shard) else None
     store = None if run.path is None else BlockStore(run.path, job.header, job.layout, blocks, job.near)
     counts = {name: _entries(at, job, blocks) for name, at in job.layout.items()}
     chosen = range(blocks) if part is None else part.of(blocks)
     total = sum(_count(job, block) for block in chosen)
-    with tqdm.tqdm(total=total, desc=label, unit="vertex", unit_scale=True, disable=not run.progress) as bar:
+    with ProgressBar(run.progress, label, total=total) as bar:
         if store is None:
             memory = _Memory(job, counts)
             _run(job, chosen, memory.place, None, executor, bar)
@@ -192,7 +214,7 @@ def compute(job: Job, run: Run, *, label: str = "precompute") -> dict[str, np.nd
             with store.writing((1, 1) if part is None else (part.number, part.count)):
                 # Another process may have finished some blocks before this one acquired the lock.
                 _run(job, _missing_blocks(store, todo), store.write, store, executor, bar)
-        bar.update(bar.total - bar.n)
+        bar.update(total - bar.count)
     if part is not None:
         left = int(np.sum(~store.written())) or len(_missing_blocks(store, set(range(blocks)) - set(chosen)))
         if left:
@@ -201,6 +223,59 @@ def compute(job: Job, run: Run, *, label: str = "precompute") -> dict[str, np.nd
                 "run the other parts, then run again without a part"
             )
     return {name: store.whole(name, count) for name, count in counts.items()}
+
+
+class ProgressBar(contextlib.AbstractContextManager):
+    """A progress bar in the terminal, or a function that is called in place of it; see `Run.progress`.
+
+    Attributes:
+        count: How many vertices are done.
+    """
+
+    def __init__(self, progress: Progress, label: str, *, total: int | None = None, unit: str = "vertex"):
+        """Starts at 0. Without a total, `update` says which share is done."""
+        self._call = progress if callable(progress) else None
+        hidden = self._call is not None or not progress
+        self._bar = tqdm.tqdm(total=total, desc=label, unit=unit, unit_scale=True, disable=hidden)
+        self._label, self._total = label, total
+        self.count = 0
+        self._told = -np.inf
+        self.update(0)
+
+    def __exit__(self, *error: Any) -> None:
+        """Ends the line of the terminal."""
+        self._bar.close()
+
+    def update(self, count: int, *, share: float | None = None, words: str = "", rays: int = 0) -> None:
+        """Adds a number of vertices.
+
+        Args:
+            count: Number of vertices that were done since the last call.
+            share: Share of all work that is done; if None, that of the total.
+            words: Text after the bar.
+            rays: Number of rays that were traced so far, for their speed after the bar.
+        """
+        self.count += count
+        if self._call is not None:
+            done = self.count / self._total if share is None and self._total else share or 0.0
+            now = time.monotonic()
+            if now - self._told >= _PAUSE or done >= 1:
+                self._told = now
+                self._call(self._label, min(done, 1.0))
+            return
+        self._bar.update(count)
+        if rays and not self._bar.disable:
+            words = f"{rays / max(self._bar.format_dict['elapsed'], 1e-9) / 1e6:.1f} Mrays/s"
+        if words:
+            self._bar.set_postfix_str(words, refresh=False)
+
+
+def tracked(items: Sequence[Item], progress: Progress, label: str, *, unit: str) -> Iterator[Item]:
+    """Yields items, and shows how many are done."""
+    with ProgressBar(progress, label, total=len(items), unit=unit) as bar:
+        for item in items:
+            yield item
+            bar.update(1)
 
 
 class _Memory:
@@ -257,13 +332,10 @@ def _run(job, todo, keep, store, executor, bar) -> None:
                     "the path must be the same shared folder for all workers"
                 )
             rays += count
-            bar.update(_count(job, block))
-            if rays:
-                speed = rays / max(bar.format_dict["elapsed"], 1e-9)
-                bar.set_postfix_str(f"{speed / 1e6:.1f} Mrays/s", refresh=False)
+            bar.update(_count(job, block), rays=rays)
     except (BrokenExecutor, CancelledError) as error:
         outcome = "they are lost" if store is None else f"they are kept in {store.path}: call again to go on"
-        raise RuntimeError(f"a worker died after {bar.n} of {job.vertices} vertices; {outcome}") from error
+        raise RuntimeError(f"a worker died after {bar.count} of {job.vertices} vertices; {outcome}") from error
     finally:
         flow.cancel()
         _jobs.pop(key, None)

@@ -7,7 +7,7 @@ construct themselves.
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
@@ -92,7 +92,12 @@ class RayCount:
 
 
 def fractional(
-    occluder: Occluder, start: Float32[np.ndarray, "v 3"], normal: Float32[np.ndarray, "v 3"], *, size: int
+    occluder: Occluder,
+    start: Float32[np.ndarray, "v 3"],
+    normal: Float32[np.ndarray, "v 3"],
+    *,
+    size: int,
+    supersample: bool = True,
 ) -> tuple[UInt8[np.ndarray, "v d"], RayCount]:
     """Visible fraction of each cubemap texel from each point, in sixteenths; 0 below the horizon.
 
@@ -106,6 +111,7 @@ def fractional(
         start: Origins of the rays, from `start_points`.
         normal: Unit normals.
         size: Edge of the cubemap's faces in texels.
+        supersample: Whether texels on a visibility boundary are supersampled.
 
     Returns:
         Visibility times 16 of the 6 size^2 texels, and the number of rays.
@@ -119,7 +125,7 @@ def fractional(
     count = RayCount(0, 0, 0)
     for first in range(0, len(start), step):
         part = slice(first, first + step)
-        count += _trace(occluder, start[part], above[part], seen[part], table)
+        count += _trace(occluder, start[part], above[part], seen[part], table, supersample)
     return seen, count
 
 
@@ -173,6 +179,7 @@ class VisibilityJob(blocks.Job):
         size: Edge of the cubemap's faces in texels.
         mesh_key: Fingerprint of the faces and of the chosen vertices.
         mesh_near: Sketches (see `jaxprt.files.arrays.sketch`) of positions, normals and tangents.
+        texels: Largest number of texels along an edge that are traced; None for all. See `jaxprt.Run`.
     """
 
     start: np.ndarray
@@ -181,6 +188,7 @@ class VisibilityJob(blocks.Job):
     size: int
     mesh_key: str
     mesh_near: Mapping[str, list[float]]
+    texels: int | None = field(default=None, kw_only=True)
 
     @classmethod
     def make(
@@ -252,7 +260,17 @@ class VisibilityJob(blocks.Job):
     def seen(self, block: int) -> tuple[UInt8[np.ndarray, "v d"], RayCount]:
         """Visibility of a block of vertices, from `fractional`."""
         part = self.part(block)
-        return fractional(self.rays, self.start[part], self.frame[part, 2], size=self.size)
+        start, normal = self.start[part], self.frame[part, 2]
+        if self.texels is None or self.texels >= self.size or self.size % self.texels:
+            return fractional(self.rays, start, normal, size=self.size)
+        seen, count = fractional(self.rays, start, normal, size=self.texels, supersample=False)
+        return _finer(seen, normal, size=self.size), count
+
+    def with_texels(self, texels: int) -> "VisibilityJob":
+        """The job with rays through larger texels, as `Run.texels` says."""
+        job = replace(self, texels=texels)
+        vars(job)["rays"] = self.rays
+        return job
 
 
 class _Tables(NamedTuple):
@@ -278,7 +296,9 @@ def _tables(size: int) -> _Tables:
     )
 
 
-def _trace(occluder: Occluder, start: np.ndarray, above: np.ndarray, seen: np.ndarray, table: _Tables) -> RayCount:
+def _trace(
+    occluder: Occluder, start: np.ndarray, above: np.ndarray, seen: np.ndarray, table: _Tables, supersample: bool
+) -> RayCount:
     """Fills `seen` for some of the points."""
     vertex, rank = np.nonzero(above.take(table.order, axis=1))
     texel = table.order.take(rank)
@@ -287,13 +307,24 @@ def _trace(occluder: Occluder, start: np.ndarray, above: np.ndarray, seen: np.nd
     if occluder.blends:
         share = occluder.passed(start, table.center, vertex, texel)
         flat[place] = _dither(LEVELS * share, vertex, texel)
-        mixed = np.flatnonzero(_varying_texels(seen, table.border).reshape(-1)[place])
+        boundary = _varying_texels
     else:
         flat[place] = ~occluder.blocked(start, table.center, vertex, texel)
-        mixed = np.flatnonzero(_boundary(seen, table.border).reshape(-1)[place])
+        boundary = _boundary
+    mixed = np.flatnonzero(boundary(seen, table.border).reshape(-1)[place]) if supersample else place[:0]
+    if not occluder.blends:
         flat[place] *= LEVELS
     flat[place[mixed]] = _supersample(occluder, start, vertex[mixed], texel[mixed], table)
     return RayCount(len(place) + LEVELS * len(mixed), len(place), len(mixed))
+
+
+def _finer(
+    coarse: UInt8[np.ndarray, "v _"], normal: Float32[np.ndarray, "v 3"], *, size: int
+) -> UInt8[np.ndarray, "v d"]:
+    """Visibility of the texels inside of larger ones; 0 below the horizon."""
+    edge = math.isqrt(coarse.shape[1] // 6)
+    wide = coarse.reshape(-1, 6, edge, edge).repeat(size // edge, 2).repeat(size // edge, 3)
+    return wide.reshape(len(coarse), -1) * (normal.astype(np.float32) @ _tables(size).area.T > 0)
 
 
 def _boundary(clear: np.ndarray, border: np.ndarray) -> np.ndarray:

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-import tqdm
 from jaxtyping import Bool, Float, Float32, Int
 from threadpoolctl import threadpool_limits
 
@@ -116,7 +115,7 @@ def refine(
     vertices: int = 100_000,
     environments: Sequence[Environment] | None = None,
     occluder: Mesh | None = None,
-    progress: bool = True,
+    progress: blocks.Progress = True,
 ) -> Mesh:
     """Subdivides the triangles of a mesh where shadows are finer than the spacing of its vertices.
 
@@ -136,7 +135,7 @@ def refine(
         environments: Lights under which the error must hold. If None, an average over lights with a natural spectrum
             and all orientations. For the shadows of a sun, give the environment that contains it.
         occluder: Geometry that casts shadows; the mesh itself if None.
-        progress: Whether to show a progress bar.
+        progress: Whether to show a progress bar, or a function; see `jaxprt.Run`.
 
     Returns:
         The subdivided mesh. The original vertices come first.
@@ -163,7 +162,7 @@ def divisions(
     vertices: int,
     environments: Sequence[Environment] | None,
     views: Sequence[Camera],
-    progress: bool,
+    progress: blocks.Progress,
 ) -> tuple[list[Division], float]:
     """Successive subdivisions that `refine` applies to a mesh, and the error that is left.
 
@@ -190,14 +189,17 @@ def divisions(
     with (
         threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(blocks.cores()) as pool,
-        tqdm.tqdm(desc="refine", unit="vertex", unit_scale=True, disable=not progress) as bar,
+        blocks.ProgressBar(progress, "refine") as bar,
     ):
+        first = None
         surface = _Surface(mesh, DiffuseTracer(mesh, occluder, samples, pool), points, _visible_places(mesh, views))
         while True:
             count, squares = len(surface.position), surface.squares()
             left = float(squares.sum(0).max()) ** 0.5
-            bar.update(count - bar.n)
-            bar.set_postfix_str(f"{100 * left:.2g} % error")
+            first = left if first is None else first
+            # Steps reduce the error by about one factor.
+            share = np.log(first / left) / np.log(first / error) if first > left > error > 0 else float(left <= error)
+            bar.update(count - bar.count, share=share, words=f"{100 * left:.2g} % error")
             if left <= error:
                 return result, left
             edges = Edges(surface.position, surface.face)

@@ -155,7 +155,7 @@ def test_the_page_of_files_is_served(place, monkeypatch, capsys):
 
 
 def test_a_port_that_is_taken_is_refused_before_anything_is_computed(monkeypatch, capsys):
-    monkeypatch.setattr(play, "ready", None)
+    monkeypatch.setattr(play, "prepare", None)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

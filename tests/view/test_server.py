@@ -450,7 +450,7 @@ def test_what_is_no_address_is_refused_before_anything_is_computed(text, monkeyp
         parse(text)
     with pytest.raises(ValueError, match="the address must be that"):
         Server(Echo(), address=text)
-    monkeypatch.setattr(play, "ready", None)
+    monkeypatch.setattr(play, "prepare", None)
     found = CliRunner().invoke(play.command, ["--address", text])
     assert "--address: the address must be that in the browser's bar" in str(found.exception)
 
@@ -458,8 +458,7 @@ def test_what_is_no_address_is_refused_before_anything_is_computed(text, monkeyp
 def test_the_command_line_prints_the_address_and_opens_no_browser(monkeypatch):
     opened = []
     monkeypatch.setattr(play.webbrowser, "open", opened.append)
-    monkeypatch.setattr(play, "ready", lambda given: ({}, {}))
-    monkeypatch.setattr(play, "serve", lambda made, environments, port, address: Server(Echo(), address=address))
+    monkeypatch.setattr(play, "prepare", lambda session, chosen: session.report("nothing", 1.0))
     monkeypatch.setattr(Server, "wait", lambda self: self.close())
     found = CliRunner().invoke(play.command, ["--address", "http://localhost:9000"])
     assert found.exception is None

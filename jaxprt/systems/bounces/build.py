@@ -112,7 +112,7 @@ def precompute(
     exchanged = exchange.make(function, whole, None if second is None else np.asarray(second.weight), edge, lamps)
     if second is not None and bounces != 2:
         worth += exchange.worth(exchanged, job.white[function], function, brought_twice)
-    if run.progress:
+    if run.progress is True:
         _tell(contribution, function, worth, second, bounces)
     rows = (members.places(member), job.region.astype(np.int32), areas(mesh).astype(whole.dtype))
     arrays = [jax.device_put(column) for column in (whole, core, blocks["mode"], *rows, function)]

@@ -19,6 +19,7 @@ _FILES = (
     "style",
     "frame",
     "piece",
+    "waiting",
     "viewer",
 )
 

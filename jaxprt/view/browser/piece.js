@@ -432,6 +432,7 @@ class Answers {
   answer(message, buffers) {
     const { content, buffers: all } = this.piece;
     switch (message.kind) {
+      case "progress": return { content: { kind: "progress", version: content.scene.version, finished: true }, buffers: [] };
       case "scene": return { content: { ...content.scene, lights: this.names }, buffers: all.slice(0, 2) };
       case "page": return { content: { ...content, kind: "page", system: Object.keys(content.scene.systems)[0] }, buffers: all.slice(2) };
       case "look": return this.look(message);

@@ -9,6 +9,7 @@ import { Pixels } from "./pixels.js";
 import { panelOf } from "./panel.js";
 import { gestures } from "./gestures.js";
 import { frameOf } from "./frame.js";
+import { Waiting, follow } from "./waiting.js";
 
 const SKY_ROWS = 1024; // of the picture of a light at rest, if its file has so many
 
@@ -31,6 +32,7 @@ export function mount(root, ask) {
   let rest = { size: "", made: 0, ms: 0 }; // whole pictures at rest of one size: how many, and what the last one took
   const viewer = `${Date.now()}-${Math.random()}`; // its name, since each viewer of a session counts its own looks
 
+  const waiting = new Waiting(busy);
   const resize = () => {
     const ratio = Math.min(window.devicePixelRatio || 1, 2), box = canvas.getBoundingClientRect();
     const width = clamp(Math.round(box.width * ratio), 1, 2048), height = clamp(Math.round(box.height * ratio), 1, 2048);
@@ -52,7 +54,7 @@ export function mount(root, ask) {
     if (appears) again();
   };
   const message = (kind) => ({
-    kind, viewer, seq, system: state.system, light: state.light, turn: state.turn, lamps: state.lamps, eye: camera.eye,
+    kind, viewer, seq, version: scene.version, system: state.system, light: state.light, turn: state.turn, lamps: state.lamps, eye: camera.eye,
     target: camera.target, field_of_view: camera.angle, bounces: state.bounces, materials: state.materials,
     stops: long ? state.stops : null, tone: state.tone,
   });
@@ -81,7 +83,7 @@ export function mount(root, ask) {
       if (content.kind === "page" && !lacking) gpu = new Pixels(drawing.gl, new Piece(content, [...from.buffers, ...buffers]), 3 * (from.backs ?? from.face.length / 3));
     } catch (error) { lacking = error.message; }
     canvas.pixels = () => gpu;
-    if (gpu && scene) moved();
+    if (gpu && scene === from) moved();
   };
   // Whether the GPU shades the present state. A slow one leaves it to Python, if that is quicker.
   const shades = () => gpu !== null && asked === state.system && !state.bounces && !(gpu.slow && scene.rests.length && stats.trip < 2 * gpu.stats.ms);
@@ -112,8 +114,9 @@ export function mount(root, ask) {
     if (unexposed) own.stops = null; // radiance, of which the exposure is found
     stats.sent++;
     try {
-      const { content, buffers } = await ask(own);
+      const { content, buffers } = await waiting.during("look", "waiting for colors from Python", ask(own));
       if (closed) return;
+      if (content.kind === "late") return load(); // there is a better scene
       if (content.kind === "error") { stats.errors++; tell(content.message); }
       else {
         const compressed = own.stops !== null, sent = buffers.reduce((total, each) => total + each.byteLength, 0);
@@ -134,7 +137,7 @@ export function mount(root, ask) {
         if (content.seq === seq) tell("");
         const rate = framed ? 1000 / (performance.now() - framed) : 0;
         framed = performance.now();
-        status(content.ms, rate, sent);
+        if (!drawing.gpu) status(content.ms, rate, sent);
         redraw();
       }
     } catch (error) {
@@ -161,7 +164,8 @@ export function mount(root, ask) {
     skyKey = { light: key, rows };
     try {
       const { content, buffers } = await ask({ ...message("sky"), rows });
-      if (closed || content.kind === "error" || skyKey.light !== key) return;
+      if (content.kind === "late") skyKey = {};
+      if (closed || content.kind !== "sky" || skyKey.light !== key) return;
       const data = new Uint16Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 2);
       if (rows === 1) controls?.paint(data, content);
       if (skyKey.rows !== rows) return; // the fine one has been asked for
@@ -182,8 +186,8 @@ export function mount(root, ask) {
     if (state.exact) steps.push(["exact", true], ["exact", false]);
     try {
       for (const [kind, coarse] of steps) {
-        if (kind === "exact") tell("the exact picture is on its way");
-        const asked = { ...message(kind), ...size, coarse, transparent: kind === "still" && !state.background }, { content, buffers } = await ask(asked);
+        const asked = { ...message(kind), ...size, coarse, transparent: kind === "still" && !state.background }, words = "computing the picture at pixels";
+        const { content, buffers } = await waiting.during("still", kind === "still" ? words : "computing the exact picture", ask(asked));
         if (closed || own !== seq || content.kind === "late") break;
         if (content.kind === "error") { tell(content.message); break; }
         const compressed = asked.stops !== null, count = content.width * content.height;
@@ -232,7 +236,8 @@ export function mount(root, ask) {
   const drop = async (file) => {
     if (file.size > 2 ** 29) return tell(`${file.name} must have at most 512 MiB, and has ${Math.ceil(file.size / 2 ** 20)}`);
     try {
-      const { content, buffers } = await ask({ kind: "drop", name: file.name }, [await file.arrayBuffer()]);
+      const sent = ask({ kind: "drop", name: file.name }, [await file.arrayBuffer()]);
+      const { content, buffers } = await waiting.during("drop", `reading ${file.name}`, sent, 0);
       if (content.kind === "error") { stats.errors++; return tell(content.message); }
       scene.lights = content.lights;
       if (gpu && buffers.length) gpu.piece.lights[content.light] = new Float32Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 4);
@@ -265,38 +270,61 @@ export function mount(root, ask) {
   // A picture of any size as a file: by Python where there is one, else by the graphics card.
   const picture = async ({ width, height, transparent }) => {
     if (!scene) throw new Error("there is no scene yet");
-    busy(`a picture of ${width} x ${height} pixels`);
-    try {
-      if (!scene.rests.includes("picture")) return await drawn(drawing, camera, { ...state, background: !transparent }, scene.center, width, height);
-      const { content, buffers } = await ask({ ...message("picture"), stops: state.stops, width, height, transparent });
-      if (content.kind === "error") throw new Error(content.message);
-      return new Blob([buffers[0]], { type: "image/png" });
-    } finally {
-      busy("");
-      redraw();
-    }
+    const python = scene.rests.includes("picture"), asked = python && { ...message("picture"), stops: state.stops, width, height, transparent };
+    const sent = python ? ask(asked) : drawn(drawing, camera, { ...state, background: !transparent }, scene.center, width, height);
+    const answer = await waiting.during("picture", `a picture of ${width} x ${height} pixels`, sent, 0);
+    redraw();
+    if (!python) return answer;
+    if (answer.content.kind === "late") throw new Error("a better scene has come meanwhile: ask again");
+    if (answer.content.kind === "error") throw new Error(answer.content.message);
+    return new Blob([answer.buffers[0]], { type: "image/png" });
   };
   let controls = null;
-  const start = async () => {
+  // What Python prepares: the page shows how far it is, and takes each better scene.
+  let unfollow = () => {}, loading = false, panelled = "";
+  const start = () => {
+    unfollow();
+    resize();
+    unfollow = follow(ask, () => ({ width: canvas.width, height: canvas.height }), (content) => {
+      if (content.kind === "error") return tell(content.message);
+      if (content.error) tell(content.error);
+      waiting.set("progress", content.finished ? "" : content.stage, content.fraction);
+      if (content.version > (scene?.version ?? 0)) load();
+    });
+  };
+  const load = async () => {
+    if (loading) return;
+    loading = true;
     try {
       const { content, buffers } = await ask({ kind: "scene" });
       if (closed) return;
       if (content.kind === "error") return tell(content.message);
+      tell("");
       const array = (buffer, kind) => new kind(buffer.buffer, buffer.byteOffset, buffer.byteLength / 4);
       const loaded = { ...content, buffers, position: array(buffers[0], Float32Array), face: array(buffers[1], Uint32Array) };
-      state.system ||= Object.keys(loaded.systems)[0];
-      if (!loaded.rests.length) await page(loaded); // of an exported scene
-      scene = loaded;
+      if (!loaded.systems[state.system]) state.system = Object.keys(loaded.systems)[0];
+      asked = "";
+      await page(loaded); // before Python is asked for colors, whose programs may have to be compiled
+      // Controls stay as they are where they show the same, because a hand may be at one.
+      const controlled = JSON.stringify([loaded.parts.map(({ name, free }) => [name, free]), loaded.lights, Object.keys(loaded.systems), loaded.rests]);
+      const had = scene?.systems[state.system]?.bounces, has = loaded.systems[state.system].bounces;
+      if (had !== has) state.bounces = has;
+      scene = Object.assign(scene ?? {}, loaded);
+      bytes = null;
       camera ??= new Camera(scene);
-      state.bounces = scene.systems[state.system].bounces;
       drawing.setMesh(scene.position, scene.face, scene.backs);
-      controls = panelOf(panel, scene, state, { set, expose, automatic, map, moved, open: drop });
+      if (controlled !== panelled) {
+        controls = panelOf(panel, scene, state, { set, expose, automatic, map, moved, open: drop });
+        [panelled, skyKey] = [controlled, {}];
+      }
       controls.show();
       resize();
       moved();
     } catch (error) {
       tell(`no answer from Python: ${error.message}`);
-      if (!closed) setTimeout(start, 1000);
+      if (!closed) setTimeout(load, 1000);
+    } finally {
+      loading = false;
     }
   };
   try { drawing = new Drawing(canvas); } catch (error) { tell(error.message); return () => {}; }
@@ -314,7 +342,7 @@ export function mount(root, ask) {
   canvas.state = state;
   canvas.camera = () => camera;
   start();
-  return () => { closed = true; watch.disconnect(); view.close(); hands(); clearTimeout(stillTimer); drawing.close(); };
+  return () => { closed = true; unfollow(); watch.disconnect(); view.close(); hands(); clearTimeout(stillTimer); drawing.close(); };
 }
 
 // A picture that the graphics card draws, as a PNG file.

@@ -1,0 +1,192 @@
+"""A session that starts without a scene: what it tells meanwhile, and how better scenes replace each other."""
+
+import threading
+
+import jax
+import numpy as np
+import pytest
+from jax._src import compiler
+
+from jaxprt import files
+from jaxprt.view import Session
+from jaxprt.view.progress import EndedError
+
+
+@pytest.fixture
+def empty():
+    """A session without a scene, whose thread has ended after the test."""
+    made = Session()
+    yield made
+    made.end()
+    for thread in threading.enumerate():
+        if thread.name == "jaxprt-prepare":
+            thread.join(60)
+
+
+def progress(session) -> dict:
+    reply = session.answer({"kind": "progress"})
+    assert reply.content["kind"] == "progress"
+    return reply.content
+
+
+def test_a_scene_that_was_there_from_the_start_is_finished(session):
+    assert progress(session) | {"stage": "", "fraction": 0.0} == {
+        "kind": "progress",
+        "stage": "",
+        "fraction": 0.0,
+        "version": 1,
+        "finished": True,
+    }
+    assert session.answer({"kind": "scene"}).content["version"] == 1
+
+
+def test_without_a_scene_progress_is_told_and_other_questions_say_why_they_wait(empty, look):
+    empty.report("tracing rays", 0.25)
+    state = {"kind": "progress", "stage": "tracing rays", "fraction": 0.25, "version": 0, "finished": False}
+    assert progress(empty) == state
+    assert empty.answer({"kind": "scene"}).content == state
+    for kind in ("look", "still", "sky", "drop"):
+        message = empty.answer(look | {"kind": kind, "name": "sky.hdr", "width": 8, "height": 8}, [b"bytes"]).content
+        assert message["kind"] == "error"
+        assert "must have a scene, and is still preparing it" in message["message"]
+
+
+def test_a_better_scene_has_a_higher_version_and_the_lights_that_were_dropped_meanwhile(
+    empty, systems, lights, look, tmp_path
+):
+    harmonics = {"lobes": systems["harmonics"]}
+    empty.show(harmonics, environments=lights, preview=True)
+    scene = empty.answer({"kind": "scene"}).content
+    assert (scene["version"], scene["rests"], scene["finished"]) == (1, [], False)
+    path = tmp_path / "new.exr"
+    files.write_exr(path, np.full((8, 16, 3), 0.25, np.float32))
+    assert empty.answer({"kind": "drop", "name": "new.exr"}, [path.read_bytes()]).content["light"] == 2
+    empty.show(systems)
+    scene = empty.answer({"kind": "scene"}).content
+    assert (scene["version"], scene["rests"]) == (2, ["still", "exact", "picture"])
+    assert scene["lights"] == ["lamp", "gray", "new"]
+    assert empty.answer(look | {"light": 2, "version": 2}).content["kind"] == "color"
+
+
+@pytest.mark.parametrize("kind", ["look", "still", "exact"])
+def test_answers_for_an_older_scene_are_late(empty, systems, lights, look, kind):
+    empty.show(systems, environments=lights, preview=True)
+    empty.show(systems)
+    asked = look | {"kind": kind, "version": 1, "width": 8, "height": 8}
+    assert empty.answer(asked).content == {"kind": "late", "seq": 1}
+
+
+def test_a_picture_under_way_is_given_up_when_a_better_scene_comes(empty, systems, lights, look, monkeypatch):
+    empty.show(systems, environments=lights)
+
+    def picture(self, look, width, height, *, samples, between):
+        empty.show(systems)
+        between()
+
+    monkeypatch.setattr("jaxprt.view.stages.Stages.picture", picture)
+    asked = look | {"kind": "still", "width": 8, "height": 8}
+    assert empty.answer(asked).content == {"kind": "late", "seq": 1}
+
+
+def test_an_error_of_the_preparation_is_told_to_the_page_and_raised_where_it_is_waited_for(empty):
+    def fail():
+        raise ValueError("the file must have triangles, got none")
+
+    empty.prepare(fail)
+    with pytest.raises(ValueError, match="must have triangles"):
+        empty.progress.wait()
+    state = progress(empty)
+    assert (state["finished"], state["error"]) == (True, "the file must have triangles, got none")
+
+
+def test_the_error_is_raised_at_once_when_a_page_was_told(empty):
+    def fail():
+        raise OSError("the disk is full")
+
+    empty.prepare(fail)
+    told = threading.Thread(target=lambda: [None for _ in iter(lambda: "error" in progress(empty), True)])
+    told.start()
+    with pytest.raises(OSError, match="the disk is full"):
+        empty.progress.wait(patience=1e6)  # no test lasts so long
+    told.join()
+
+
+def test_a_session_that_ends_stops_its_preparation_at_the_next_report(empty):
+    began, ended, steps = threading.Event(), threading.Event(), []
+
+    def make():
+        began.set()
+        ended.wait(60)
+        steps.append("report")
+        empty.report("tracing rays", 0.5)
+        steps.append("after")
+
+    empty.prepare(make)
+    assert began.wait(60)
+    empty.end()
+    ended.set()
+    empty.progress.wait()
+    assert steps == ["report"]
+    with pytest.raises(EndedError):
+        empty.report("tracing rays", 1.0)
+
+
+def test_looks_are_answered_while_a_picture_compiles(session, look, monkeypatch):
+    def changed(number):
+        state = {"turn": 0.1 * number, "materials": {"ball": {"f0": 0.02 * number}}}
+        return look | {"system": "harmonics", "viewer": "a", "eye": [2.0, 1.5 + 0.1 * number, 4.0], **state}
+
+    assert session.answer(changed(1)).content["kind"] == "color"
+    began, release, replies = threading.Event(), threading.Event(), []
+    compile_now = compiler.compile_or_get_cached
+
+    def held(*argument, **named):
+        if threading.current_thread() is still:
+            began.set()
+            release.wait(600)
+        return compile_now(*argument, **named)
+
+    monkeypatch.setattr(compiler, "compile_or_get_cached", held)
+    # A picture of a size that no other test asks for.
+    asked = changed(1) | {"kind": "still", "viewer": "b", "width": 23, "height": 19}
+    still = threading.Thread(target=lambda: replies.append(session.answer(asked)))
+    still.start()
+    assert began.wait(600)
+    for number in range(2, 22):
+        assert session.answer(changed(number)).content["kind"] == "color"
+    assert still.is_alive()
+    assert not replies
+    release.set()
+    still.join()
+    assert replies[0].content["kind"] == "still"
+
+
+def test_after_the_preparation_the_first_changes_compile_no_program(empty, systems, lights, look):
+    size = {"width": 64, "height": 48}
+    empty.answer({"kind": "progress", **size})
+    look |= {"system": "harmonics"}
+    empty.prepare(lambda: empty.show({"harmonics": systems["harmonics"]}, environments=lights))
+    empty.progress.wait()
+    while not progress(empty)["finished"]:
+        assert empty.answer(look).content["kind"] == "color"
+    compiled = []
+
+    def count(event: str, duration_secs: float, **more):
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(duration_secs)
+
+    scene = empty.answer({"kind": "scene"}).content
+    asked = look | {"eye": scene["eye"], "target": scene["target"]}
+    jax.monitoring.register_event_duration_secs_listener(count)
+    try:
+        for change in (
+            {"turn": 0.3},
+            {"eye": [2.0, 1.0, 3.0]},
+            {"materials": {"ball": {"roughness": 0.7, "f0": 0.3}}},
+            {"materials": {"ground": {"diffuse": [0.1, 0.2, 0.3]}}},
+            {"kind": "still", **size},
+        ):
+            assert empty.answer(asked | change).content["kind"] in ("color", "still")
+    finally:
+        jax.monitoring.unregister_event_duration_listener(count)
+    assert not compiled
