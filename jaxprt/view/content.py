@@ -72,7 +72,7 @@ def scene_content(page: PageScene) -> tuple[dict[str, Any], list[bytes]]:
     rows = zip(page.scene.parts, page.shading, page.parts, bits, normals, strict=True)
     for part, shading, held, bit, direction in rows:
         start, table = tables.add(f"part {part.name!r}", held)
-        weight, seen, described = _weights(shading, held), held.means, _material_json(part.material, shading)
+        weight, seen, described = _weights(shading, held), held.means, _material_json(part, shading)
         count = held.vector.shape[1]
         about = held.description | {"family": _family(shading), "texels": bool(bit.size) or bool(page.unshadowed)}
         about |= {"name": part.name, "count": count, "channels": weight.shape[1] - 1}
@@ -220,8 +220,11 @@ def _colors(material: Any, *names: str) -> dict[str, list[float]]:
     return {name: np.broadcast_to(np.asarray(getattr(material, name), float), 3).tolist() for name in names}
 
 
-def _material_json(material: Any, shading: Shading) -> dict[str, Any] | None:
+def _material_json(part: Part, shading: Shading) -> dict[str, Any] | None:
     """Parameters of a material that is the same at all vertices; None for other materials."""
+    material = part.material
+    if part.color is not None:
+        return None
     if isinstance(material, BlinnPhong) and shading.table == standard.BLINN_PHONG:
         return {"material": _colors(material, "diffuse", "specular") | {"exponent": float(material.exponent)}}
     if isinstance(material, CookTorrance) and shading.table == standard.COOK_TORRANCE:

@@ -293,6 +293,8 @@ export class Piece {
     }
     return result;
   }
+  // The first of some parts that have a material for each vertex, which cannot change; none if all can.
+  fixed(names) { return this.content.parts.find((part) => !part.material && Object.keys(names[part.name] ?? {}).length)?.name; }
   // Weights of a part whose material is one for all vertices, as `MetallicRoughness.coefficient` has them.
   material(part, change) {
     const own = part.material;

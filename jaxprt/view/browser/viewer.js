@@ -86,7 +86,7 @@ export function mount(root, ask) {
     if (gpu && scene === from) moved();
   };
   // Whether the GPU shades the present state. A slow one leaves it to Python, if that is quicker.
-  const shades = () => gpu !== null && asked === state.system && !state.bounces && !(gpu.slow && scene.rests.length && stats.trip < 2 * gpu.stats.ms);
+  const shades = () => gpu !== null && asked === state.system && !state.bounces && !gpu.piece.fixed(state.materials) && !(gpu.slow && scene.rests.length && stats.trip < 2 * gpu.stats.ms);
   const shade = () => {
     stats.sent++;
     gpu.change(message("look"));
@@ -151,7 +151,7 @@ export function mount(root, ask) {
     else if (stats.shown === seq && partial) look("unseen");
     else if (stats.shown === seq) { sky(); stillTimer = setTimeout(rested, 250); }
   };
-  const why = () => lacking || (state.bounces ? "reflected light" : gpu?.slow ? "the browser has no quick GPU" : "");
+  const why = () => lacking || (state.bounces ? "reflected light" : gpu?.piece.fixed(state.materials) ? `the material of ${gpu.piece.fixed(state.materials)} is one of vertices` : gpu?.slow ? "the browser has no quick GPU" : "");
   const status = (ms, rate, bytes) => {
     const number = (x) => x.toFixed(x < 10 ? 1 : 0);
     line.textContent = `light ${number(ms.light)} ms · view ${number(ms.view)} ms · combine ${number(ms.combine)} ms · ` +
