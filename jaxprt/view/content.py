@@ -3,6 +3,7 @@
 Exported pages hold it, and viewers that run Python send it to their page once.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,6 +16,7 @@ from jaxprt.brdf.varying import Channels
 from jaxprt.relit.channels import Shading
 from jaxprt.scene import Environment, Part, TexturedMaterial, material_table
 from jaxprt.scene.material import Texture
+from jaxprt.scene.material_table import MaterialTable
 from jaxprt.sphere import cubemap
 from jaxprt.systems import standard
 from jaxprt.systems.lobe import blurred_light
@@ -26,6 +28,8 @@ _STARTS = ("first", "weightStart", "pyramidStart", "visibleStart", "arrivedStart
 # Terms by which the page's module represents `ShininessFamily` and `SlopeFamily`.
 _TERMS = {standard.BLINN_PHONG: [3, 4], standard.COOK_TORRANCE: [3, 5, 6]}
 _LIGHT = 32  # most texels along the edge of the faces of the light that lobes read without visibility
+_IMAGE = 512  # most texels along an edge of an image
+_IMAGES = ("base_color", "roughness", "metallic")  # textures that pages read at pixels
 _SKY = 64  # most texels along the edge of a light's faces
 
 
@@ -65,14 +69,15 @@ def scene_content(page: PageScene) -> tuple[dict[str, Any], list[bytes]]:
     unit, visible_unit = unit_of([held.vector for held in page.parts]), unit_of([held.visible for held in page.parts])
     terms = max(-(-len(unit) // 4) * 4, 4)
     place: dict[str, int] = dict.fromkeys(_STARTS, 0)
-    tables, normals = _Tables(), _normals(page)
+    tables, images, materials = _Tables(), _Images(), material_table.of_parts(page.scene.parts)
+    normals = _normals(page, materials)
     parts, scale = [], page.scales
     stride = 0 if scale is None else int(scale.total - scale.start[page.level])
     arrays: list[list[np.ndarray]] = [[] for _ in range(6)]
     rows = zip(page.scene.parts, page.shading, page.parts, bits, normals, strict=True)
     for part, shading, held, bit, direction in rows:
         start, table = tables.add(f"part {part.name!r}", held)
-        weight, seen, described = _weights(shading, held), held.means, _material_json(part, shading)
+        weight, seen, described = _weights(shading, held), held.means, _material_json(part, shading, images)
         count = held.vector.shape[1]
         about = held.description | {"family": _family(shading), "texels": bool(bit.size) or bool(page.unshadowed)}
         about |= {"name": part.name, "count": count, "channels": weight.shape[1] - 1}
@@ -97,6 +102,9 @@ def scene_content(page: PageScene) -> tuple[dict[str, Any], list[bytes]]:
     content |= {"texelEdge": edge, "texels": texels_of(edge) if edge else 0, "visibility": not page.unshadowed}
     joined = [np.concatenate(column) for column in arrays]
     joined.insert(3, tables.joined())
+    coordinate = np.asarray(materials.coordinate)[: place["first"]] if images.described else np.zeros((0, 4))
+    joined += [coordinate.astype("<f4"), *images.data]
+    content["images"] = images.described
     joined[2] = np.append(joined[2], np.zeros(4 - len(joined[2]) % 4, np.uint8))  # whole words
     added, reflected = _reflected(page)
     return content | added, [array.tobytes() for array in (*joined, reflected)]
@@ -115,9 +123,9 @@ def _reflected(page: PageScene) -> tuple[dict[str, Any], Int8[np.ndarray, " n"]]
     return {"reflectedUnit": unit.tolist()}, np.concatenate(columns)
 
 
-def _normals(page: PageScene) -> list[Float[np.ndarray, "v 3"]]:
+def _normals(page: PageScene, materials: MaterialTable) -> list[Float[np.ndarray, "v 3"]]:
     """Normals at the vertices of each part, with those of normal maps."""
-    tilted = material_table.of_parts(page.scene.parts).at_vertices().normal
+    tilted = materials.at_vertices().normal
     if tilted is None:
         return [np.asarray(shading.mesh.normal) for shading in page.shading]
     counts = [len(shading.mesh.normal) for shading in page.shading]
@@ -145,6 +153,39 @@ class _Tables:
     def joined(self) -> Float[np.ndarray, " n"]:
         """The texels of all tables."""
         return np.concatenate([table.astype("<f4").reshape(-1) for _, table in self._made.values()])
+
+
+class _Images:
+    """The images of a page's textures. Textures of one image share it.
+
+    Attributes:
+        described: Size and number of channels of each image.
+        data: Bytes of each image, first row on top; colors are encoded by sRGB.
+    """
+
+    def __init__(self):
+        """Starts without images."""
+        self.described: list[dict[str, int]] = []
+        self.data: list[np.ndarray] = []
+        self._number: dict[tuple[int, bool], int] = {}
+
+    def add(self, texture: Texture, *, colored: bool) -> dict[str, Any]:
+        """How a texture reads its image, which is added where it is new."""
+        key = id(texture.image), colored
+        if key not in self._number:
+            value = np.asarray(texture.image, np.float64)
+            while max(value.shape[:2]) > _IMAGE and not (value.shape[0] % 2 or value.shape[1] % 2):
+                value = value.reshape(value.shape[0] // 2, 2, value.shape[1] // 2, 2, -1).mean((1, 3))
+            value = np.clip(value, 0, 1)
+            if colored:
+                value = np.broadcast_to(value, (*value.shape[:2], 3))
+                value = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
+            height, width, channels = value.shape
+            self._number[key] = len(self.data)
+            self.described.append({"width": width, "height": height, "channels": channels})
+            self.data.append(np.round(255 * value).astype(np.uint8))
+        how = {"transform": np.asarray(texture.transform, float).tolist(), "set": texture.set, "wrap": texture.wrap}
+        return {"image": self._number[key], **how}
 
 
 def _bytes(value: Float[np.ndarray, "k v"], unit: Float[np.ndarray, " m"], length: int) -> Float[np.ndarray, "v l"]:
@@ -220,22 +261,25 @@ def _colors(material: Any, *names: str) -> dict[str, list[float]]:
     return {name: np.broadcast_to(np.asarray(getattr(material, name), float), 3).tolist() for name in names}
 
 
-def _material_json(part: Part, shading: Shading) -> dict[str, Any] | None:
-    """Parameters of a material that is the same at all vertices; None for other materials."""
+def _material_json(part: Part, shading: Shading, images: _Images) -> dict[str, Any] | None:
+    """Parameters of a material without attributes of vertices, with its textures; None for other materials."""
     material = part.material
-    if part.color is not None:
-        return None
     if isinstance(material, BlinnPhong) and shading.table == standard.BLINN_PHONG:
         return {"material": _colors(material, "diffuse", "specular") | {"exponent": float(material.exponent)}}
     if isinstance(material, CookTorrance) and shading.table == standard.COOK_TORRANCE:
         return {"material": _colors(material, "diffuse", "specular", "f0") | {"slope": float(material.roughness)}}
-    if not isinstance(material, TexturedMaterial) or shading.scale is None:
-        return None
-    if any(isinstance(leaf, Texture) for leaf in jax.tree.leaves(material, is_leaf=lambda x: isinstance(x, Texture))):
+    if not isinstance(material, TexturedMaterial) or shading.scale is None or part.color is not None:
         return None
     names = ("base_color", "metallic", "specular", "specular_color", "ior", "roughness")
-    values = {name: np.asarray(getattr(material, name), float).tolist() for name in names}
-    return {"material": values}
+    values: dict[str, Any] = {name: np.asarray(getattr(material, name), float).tolist() for name in names}
+    fields = {
+        field.name.removesuffix("_texture"): getattr(material, field.name) for field in dataclasses.fields(material)
+    }
+    textures = {name: value for name, value in fields.items() if isinstance(value, Texture)}
+    if set(textures) - {*_IMAGES, "normal", "alpha"}:
+        return None
+    read = {name: images.add(textures[name], colored=name == "base_color") for name in _IMAGES if name in textures}
+    return {"material": values, "textures": read}
 
 
 def light_texels(light: Environment, size: int) -> bytes:

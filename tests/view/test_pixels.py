@@ -1,6 +1,7 @@
 """Pixels that the browser's GPU shades are those of the scene as the page holds it, and nearly those of the scene."""
 
 import base64
+import dataclasses
 from collections import Counter
 
 import equinox as eqx
@@ -13,7 +14,7 @@ from jaxprt.compile import put
 from jaxprt.relit.build import shaded as shaded_parts
 from jaxprt.relit.groups import Place
 from jaxprt.relit.scene import RelitScene
-from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial, builtin
+from jaxprt.scene import Camera, Environment, Part, Scene, Texture, TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
 from jaxprt.view import Server, Session, messages, stages
 from jaxprt.view import browser as modules
@@ -87,7 +88,9 @@ MATTE = TexturedMaterial(base_color=(0.4, 0.5, 0.4), metallic=0.0, specular=0.0)
 def scene_of(ball, ground):
     mesh = builtin.plane(cells=8)
     mesh = eqx.tree_at(lambda plane: plane.position, mesh, 3 * mesh.position - np.array([0, 1, 0], np.float32))
-    return Scene([Part("ball", builtin.sphere(rings=12, sectors=24), ball), Part("ground", mesh, ground)])
+    sphere = builtin.sphere(rings=12, sectors=24)
+    sphere = dataclasses.replace(sphere, texture=np.asarray(sphere.position)[:, :2] * 0.7 + 0.4)
+    return Scene([Part("ball", sphere, ball), Part("ground", mesh, ground)])
 
 
 def inside(covered):
@@ -99,7 +102,16 @@ def inside(covered):
     return result
 
 
+def textured():
+    """A material whose colors and roughness are images."""
+    rng = np.random.default_rng(3)
+    colors, shares = rng.uniform(0.2, 0.9, (8, 16, 3)), rng.uniform(0.5, 1.0, (8, 16, 1))
+    images = {"base_color_texture": Texture(colors, wrap=("repeat", "clamp")), "roughness_texture": Texture(shares)}
+    return TexturedMaterial(base_color=(0.9, 0.8, 0.7), metallic=0.3, roughness=0.8, **images)
+
+
 CASES = {
+    "textured": (textured(), MATTE, prt.relit.Lobes(8, texels=2)),
     "glossy": (GLOSSY, MATTE, prt.relit.Lobes(8, texels=2)),
     "matte": (MATTE, MATTE, prt.relit.Lobes(8, texels=2)),
     "metal": (METAL, GLOSSY, prt.relit.Lobes(8, texels=2)),
@@ -201,7 +213,7 @@ def test_why_a_scene_is_not_shaded_by_the_gpu_is_said(systems, lights, look):
     )
     session = Session({"lobes": bare, "others": others}, environments=lights)
     content, buffers = session.answer({"kind": "page", "system": "lobes"})
-    assert (content["kind"], content["visibility"], len(buffers)) == ("page", True, 8 + len(content["rims"]) + 2)
+    assert (content["kind"], content["visibility"], len(buffers)) == ("page", True, 9 + len(content["rims"]) + 2)
     content, buffers = session.answer({"kind": "page", "system": "others"})
     assert "part 'ball' must have the transfer matrices of direct light" in content["missing"]
     assert not buffers

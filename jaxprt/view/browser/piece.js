@@ -6,6 +6,7 @@ import { ARRIVE, GATHER, SHADE, SIGHT, WHOLE, WIDTH } from "./shading.js";
 import { gathered, harmonics } from "./harmonics.js";
 import { Blur, SIDES, grid, halved, readHdr, rimmed, toCubemap, toHalf, toSky, whole } from "./lights.js";
 
+const TEXTURES = ["base_color", "roughness", "metallic"]; // that are read at pixels
 const FINE = 4; // parts along the edge of a texel by which the rim of a lamp is found
 
 export class Piece {
@@ -21,6 +22,8 @@ export class Piece {
     this.weights = next(Float32Array);
     this.visible = next(Int8Array);
     this.bits = next(Uint8Array);
+    this.coordinates = next(Float32Array);
+    this.images = content.images.map(() => next(Uint8Array));
     this.reflected = next(Int8Array);
     this.index = new Map(content.rims.map((edge) => [edge, next(Uint32Array)]));
     this.lights = Array.from({ length: content.lights }, () => next(Float32Array));
@@ -46,6 +49,7 @@ export class Piece {
     this.texture("bits", gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, words(this.bits), 1);
     this.texture("table", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.table, 4);
     this.texture("weights", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.weights, 4);
+    this.texture("coordinates", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.coordinates, 4);
     this.texture("visible", gl.RGBA8I, gl.RGBA_INTEGER, gl.BYTE, this.visible, 4);
     this.texture("reflected", gl.RGBA8I, gl.RGBA_INTEGER, gl.BYTE, this.reflected, 4);
     for (const name of ["light", "bright", "gathered"]) this.texture(name, gl.RGBA32F, gl.RGBA, gl.FLOAT, none, 4);
@@ -69,11 +73,38 @@ export class Piece {
     }
     // The last row of reflections is the light of lamps, which no environment changes.
     this.degree = Math.max(Math.round(Math.sqrt(content.vectorUnit.length)), 1, Math.floor(Math.sqrt(content.reflectedUnit.length)), ...content.parts.map((part) => part.bands)) - 1;
-    for (const part of content.parts) part.written = "";
+    for (const part of content.parts) {
+      part.written = "";
+      part.samplers = TEXTURES.map((name) => part.textures?.[name] && this.sampler(part.textures[name], name));
+    }
+    this.sampling = TEXTURES.map(() => this.unit++);
+    for (const program of [this.programs.vertex, this.programs.pixel]) {
+      gl.useProgram(program);
+      TEXTURES.forEach((name, i) => gl.uniform1i(this.at(`${name}Image`, program), this.sampling[i]));
+    }
     [this.lit, this.turned, this.colored] = ["", "", null];
+  }
+  // The image of a texture, with mip maps.
+  sampler({ image, wrap }, name) {
+    const { gl } = this, { width, height, channels } = this.content.images[image], data = this.images[image], made = gl.createTexture();
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, made);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    if (channels === 3) {
+      const colors = new Uint8Array(4 * width * height);
+      for (let i = 0, to = 0; i < data.length; i += 3, to += 4) [colors[to], colors[to + 1], colors[to + 2], colors[to + 3]] = [data[i], data[i + 1], data[i + 2], 255];
+      gl.texImage2D(gl.TEXTURE_2D, 0, name === TEXTURES[0] ? gl.SRGB8_ALPHA8 : gl.RGBA8, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, colors);
+    } else gl.texImage2D(gl.TEXTURE_2D, 0, gl.R8, width, height, 0, gl.RED, gl.UNSIGNED_BYTE, data);
+    gl.generateMipmap(gl.TEXTURE_2D);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+    const many = gl.getExtension("EXT_texture_filter_anisotropic");
+    if (many) gl.texParameterf(gl.TEXTURE_2D, many.TEXTURE_MAX_ANISOTROPY_EXT, Math.min(8, gl.getParameter(many.MAX_TEXTURE_MAX_ANISOTROPY_EXT)));
+    [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T].forEach((side, i) => gl.texParameteri(gl.TEXTURE_2D, side, { repeat: gl.REPEAT, mirror: gl.MIRRORED_REPEAT, clamp: gl.CLAMP_TO_EDGE }[wrap[i]]));
+    return made;
   }
   close() {
     const { gl } = this;
+    for (const part of this.content.parts) for (const made of part.samplers) if (made) gl.deleteTexture(made);
     for (const { made, frame } of Object.values(this.textures)) { gl.deleteTexture(made); if (frame) gl.deleteFramebuffer(frame); }
     for (const program of Object.values(this.programs)) gl.deleteProgram(program);
     gl.deleteVertexArray(this.empty);
@@ -258,7 +289,8 @@ export class Piece {
     const { gl, content } = this;
     gl.uniform3fv(this.at("eye", program), message.eye);
     for (const part of content.parts) {
-      const { weightStep, log } = this.material(part, message.materials[part.name]);
+      const { weightStep, log, factors } = this.material(part, message.materials[part.name]);
+      this.sample(program, part, factors);
       for (const name of ["first", "count", "lobes", "channels", "nodes", "tableStart", "weightStart", "pyramidStart", "bands", "entries", "arrivedStart"]) gl.uniform1i(this.at(name, program), part[name]);
       gl.uniform1f(this.at("steps", program), part.steps);
       gl.uniform1f(this.at("logRoughness", program), log);
@@ -270,6 +302,25 @@ export class Piece {
       if (part.knot.length) gl.uniform1fv(this.at("knot", program), part.knot);
       over(part);
     }
+  }
+  // Has a program read the textures of a part, which its factors multiply.
+  sample(program, part, factors) {
+    const { gl } = this, at = (name) => this.at(name, program);
+    const found = part.samplers.map((made, i) => (made ? 1 << i : 0));
+    gl.uniform1i(at("sampled"), found[0] + found[1] + found[2]);
+    if (!found.some(Boolean)) return;
+    gl.uniform3fv(at("baseColor"), factors.base);
+    gl.uniform3fv(at("f0"), factors.f0);
+    gl.uniform4f(at("factors"), factors.specular, factors.metallic, factors.roughness, 0);
+    TEXTURES.forEach((name, i) => {
+      if (!part.samplers[i]) return;
+      const { transform, set } = part.textures[name];
+      gl.activeTexture(gl.TEXTURE0 + this.sampling[i]);
+      gl.bindTexture(gl.TEXTURE_2D, part.samplers[i]);
+      gl.uniform1i(at(`sets[${i}]`), set);
+      gl.uniform3fv(at(`across[${i}]`), transform[0]);
+      gl.uniform3fv(at(`upward[${i}]`), transform[1]);
+    });
   }
   // Radiance of the vertices into the texture of colors.
   vertices(message) {
@@ -325,7 +376,8 @@ export class Piece {
       base.map((x) => dielectric * (1 - own.specular) * x),
     ];
     this.write(part, every);
-    return { weightStep: 0, log: Math.log(Math.max(value.roughness, 1e-3 ** 0.5)) };
+    const factors = { base, f0, specular: own.specular, metallic: value.metallic, roughness: value.roughness };
+    return { weightStep: 0, log: Math.log(Math.max(value.roughness, 1e-3 ** 0.5)), factors };
   }
   write(part, every) {
     const gl = this.gl, key = JSON.stringify(every);

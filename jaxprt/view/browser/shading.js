@@ -34,6 +34,9 @@ uniform int first, count, lobes, channels, nodes, knots, tableStart, weightStart
 uniform float knot[KNOTS], scale[4], logRoughness, steps;
 uniform int edges[LEVELS], starts[LEVELS], lightEdges[WIDTHS], lightStarts[WIDTHS];
 uniform float spreads[LEVELS], lightSpreads[WIDTHS];
+uniform sampler2D coordinates, base_colorImage, roughnessImage, metallicImage;
+uniform int sampled, sets[3]; // which textures there are, and the coordinates and transform of each
+uniform vec3 across[3], upward[3], baseColor, f0; uniform vec4 factors; // specular, metallic, roughness
 ${AT} ${CUBE} ${BRIGHT}
 int corner[CORNERS]; // vertices of the part, and how much each counts
 float share[CORNERS];
@@ -224,6 +227,33 @@ vec3 transferred(vec3 ahead, ivec2 number, float between, int node, float upper,
   }
   return result;
 }
+// Both sets of texture coordinates, and their change from pixel to pixel.
+vec4 coordinate = vec4(0), toRight = vec4(0), toTop = vec4(0);
+#if CORNERS == 3
+bool coordinateOf(ivec2 pixel, out vec4 result) {
+  uvec4 triangle = texelFetch(shown, pixel, 0);
+  result = vec4(0);
+  if (int(triangle.x) < first || int(triangle.x) >= first + count) return false;
+  vec2 part = unpackUnorm2x16(triangle.w);
+  result = part.x * texelFetch(coordinates, at(int(triangle.x)), 0) + part.y * texelFetch(coordinates, at(int(triangle.y)), 0) + (1. - part.x - part.y) * texelFetch(coordinates, at(int(triangle.z)), 0);
+  return true;
+}
+vec4 change(ivec2 step) { // the smaller one to both sides, as the other may cross a seam
+  vec4 after, before;
+  bool a = coordinateOf(ivec2(gl_FragCoord.xy) + step, after), b = coordinateOf(ivec2(gl_FragCoord.xy) - step, before);
+  after -= coordinate;
+  before = coordinate - before;
+  return a && b ? (dot(after, after) < dot(before, before) ? after : before) : a ? after : b ? before : vec4(0);
+}
+#endif
+vec2 placed(vec4 both, int which, float one) {
+  vec3 place = vec3(sets[which] > 0 ? both.zw : both.xy, one);
+  return vec2(dot(across[which], place), one - dot(upward[which], place)); // images have their first row on top
+}
+vec4 read(sampler2D image, int which) {
+  vec2 place = placed(coordinate, which, 1.);
+  return CORNERS == 1 ? textureLod(image, place, 0.) : textureGrad(image, place, placed(toRight, which, 0.), placed(toTop, which, 0.));
+}
 vec3 shade() {
   vec4 leading = weightAt(0);
   vec3 w[4], color = weightAt(channels).rgb;
@@ -231,6 +261,17 @@ vec3 shade() {
   vec4 diffuse = vec4(1);
   vec3 wo = normal;
   float rough = weightStep > 0 ? leading.a : logRoughness;
+  if (sampled > 0) { // weights as MetallicRoughness.coefficient has them
+    for (int k = 0; k < CORNERS; k++) coordinate += share[k] * texelFetch(coordinates, at(first + corner[k]), 0);
+#if CORNERS == 3
+    toRight = change(ivec2(1, 0));
+    toTop = change(ivec2(0, 1));
+#endif
+    vec3 base = (sampled & 1) > 0 ? baseColor * read(base_colorImage, 0).rgb : baseColor;
+    float metal = (sampled & 4) > 0 ? factors.y * read(metallicImage, 2).r : factors.y, dielectric = 1. - metal, layer = dielectric * factors.x;
+    rough = log(max((sampled & 2) > 0 ? factors.z * read(roughnessImage, 1).r : factors.z, .0316227766));
+    for (int k = 0; k < 4; k++) if (k < channels) w[k] = (term[k] == 0 ? layer * base * (1. - max(f0.r, max(f0.g, f0.b))) : term[k] == 1 ? layer * f0 + metal * base : term[k] == 2 ? layer * (1. - f0) + metal * (1. - base) : dielectric * (1. - factors.x) * base) / scale[k];
+  }
   if (lobes > 0 || bands > 0) {
     wo = normalize(eye - position);
     vec3 flat_ = wo - normal * dot(wo, normal);
