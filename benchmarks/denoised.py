@@ -89,7 +89,9 @@ class View:
         return np.array(self._mitsuba.render(self._scene, integrator=integrator, spp=samples, seed=number))
 
 
-def denoise(radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray, *, clean: bool) -> np.ndarray:
+def denoise(
+    radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray, *, clean: bool, quality: str = "high"
+) -> np.ndarray:
     """A picture [h w 3] without most of its noise.
 
     Args:
@@ -97,11 +99,12 @@ def denoise(radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray, *, cle
         albedo: Of the first surface.
         normal: Of the first surface.
         clean: Whether albedo and normal count as free of noise, which takes a larger network.
+        quality: "high", "balanced" or "fast".
     """
     import pyoidn
 
     color = np.ascontiguousarray(radiance[..., :3])
-    return pyoidn.denoise(color, np.clip(albedo, 0, 1), normal, hdr=True, clean_aux=clean)
+    return pyoidn.denoise(color, np.clip(albedo, 0, 1), normal, hdr=True, clean_aux=clean, quality=quality)
 
 
 class Truth:
