@@ -182,7 +182,7 @@ def test_commands_take_the_names(installed, tmp_path, capsys):
         program(["export", *map(str, given), "--brdf", "lambert:albedo=.5", "--output", str(page), "--json"])
     assert not end.value.code
     (row,) = json.loads(capsys.readouterr().out)
-    assert row["error"] < 0.02
+    assert row["error"] < 0.03  # of pixels, with the light of harmonics
     with pytest.raises(SystemExit) as end:
         program(["export", *map(str, given), "--brdf", "alpha-ggx:alpha=.2", "--output", str(page)])
     assert end.value.code == 2

@@ -356,6 +356,9 @@ def scene_verbs() -> dict[str, Verb]:
         "view.export": Verb(  # Right values take seconds; the viewer above checks environments in the same way.
             prt.view.export, keep=("environments",), scene=ready, path="/missing/x.html", environments=None, most=1e9
         ),
+        "view.export_gltf": Verb(
+            prt.view.export_gltf, scene=ready, path="x.glb", environments={"one": environment()}, degree=2
+        ),
         "view.export_baked": Verb(
             prt.view.export_baked,
             scene=ready,
