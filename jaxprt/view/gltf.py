@@ -22,7 +22,7 @@ from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, Part, TexturedMaterial
 from jaxprt.scene.material import Texture
 from jaxprt.sphere import harmonics
-from jaxprt.systems import axes
+from jaxprt.systems import axes, protocol
 from jaxprt.view.stages import counterclockwise
 
 DEGREE = 3  # of the transfer: 16 harmonics in four attributes
@@ -136,9 +136,13 @@ def export_gltf(
     require.kind("the scene", scene, RelitScene, source="jaxprt.precompute")
     require.count("degree", degree, least=0, most=MOST_DEGREE)
     path = outputs.target(path, ".glb")
+    if environments is not None and not isinstance(environments, Mapping):
+        got = require.shown(environments)
+        raise TypeError(f"environments must be a dictionary from names to lights, got {got}")
     lights = {} if environments is None else dict(environments)
     for name, light in lights.items():
-        require.kind(f"the light {name!r}", light, Environment, source="jaxprt.load_environment")
+        protocol.one_light(light)
+        require.colors(f"the light {name!r}", light.radiance)
     file = _File()
     for number, (part, shading) in enumerate(zip(scene.scene.parts, scene.shading, strict=True)):
         attributes, material = _attributes(file, part), _material(file, part, shading)
