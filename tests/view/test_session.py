@@ -307,6 +307,7 @@ def test_a_dropped_file_becomes_a_light(session, look, tmp_path):
     files.write_exr(path, np.full((8, 16, 3), 0.25, np.float32))
     reply = session.answer({"kind": "drop", "name": "gray.exr"}, [path.read_bytes()])
     assert reply.content == {"kind": "lights", "lights": ["lamp", "gray", "gray"], "light": 2}
+    np.testing.assert_allclose(np.frombuffer(reply.buffers[0], "<f4"), np.full(6 * 8 * 8 * 3, 0.25), rtol=1e-5)
     near(halves(session.answer(look | {"light": 2})) * 2, halves(session.answer(look | {"light": 1})))
 
 

@@ -39,7 +39,7 @@ export class Pixels {
     this.trial = PIXEL_EDGES.map(() => ({ after: 0, pause: 2000 })); // when a finer level may be tried again
     this.quick = 0; // quick frames one after another
     this.strip = 1 << 14; // pixels at rest that are shaded in one call
-    this.stats = { level: 1, samples: 0, ms: 0 };
+    this.stats = { level: PIXEL_EDGES[this.level], samples: 0, ms: 0 };
     this.build();
   }
   build() {

@@ -96,8 +96,8 @@ export function mount(root, ask) {
     }
     Object.assign(stats, { got: stats.got + 1, shown: seq });
     tell("");
-    const size = gpu.stats.level ? `pixels of ${gpu.stats.level}` : "vertices";
-    line.textContent = `${size} by the browser's GPU, ${gpu.stats.ms.toFixed(0)} ms · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}`;
+    const size = gpu.stats.level ? (gpu.stats.level === 1 ? "pixels" : `pixels of ${gpu.stats.level} x ${gpu.stats.level}`) : "vertices";
+    line.textContent = `${size} by the browser's GPU${gpu.stats.ms ? `, ${gpu.stats.ms.toFixed(0)} ms` : ""} · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}`;
     redraw();
     sky();
     stillTimer = setTimeout(rested, 250);
