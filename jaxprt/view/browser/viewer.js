@@ -13,6 +13,7 @@ import { Waiting, follow } from "./waiting.js";
 
 const SKY_ROWS = 1024; // of the picture of a light at rest, if its file has so many
 
+const TRIES = 3; // answers of Python until their time counts: the first ones wait for compilers
 const SLOW = 500; // milliseconds of a whole picture from which on a coarse one comes first
 
 export function mount(root, ask) {
@@ -68,6 +69,7 @@ export function mount(root, ask) {
     redraw();
     look();
   };
+  let looked = 0; // answers of Python
   // The GPU's scene: what it holds of a system, asked for once. Other states have their colors from Python.
   let gpu = null, asked = "", lacking = "";
   const page = async (from = scene) => {
@@ -86,7 +88,7 @@ export function mount(root, ask) {
     if (gpu && scene === from) moved();
   };
   // Whether the GPU shades the present state. A slow one leaves it to Python, if that is quicker.
-  const shades = () => gpu !== null && asked === state.system && !state.bounces && !gpu.piece.fixed(state.materials) && !(gpu.slow && scene.rests.length && stats.trip < 2 * gpu.stats.ms);
+  const shades = () => gpu !== null && asked === state.system && !state.bounces && !gpu.piece.fixed(state.materials) && !(gpu.slow && scene.rests.length && (looked < TRIES || stats.trip < 2 * gpu.stats.ms));
   const shade = () => {
     stats.sent++;
     gpu.change(message("look"));
@@ -129,6 +131,7 @@ export function mount(root, ask) {
           find();
         }
         stats.trip = performance.now() - began;
+        looked++;
         const spent = content.ms.light + content.ms.view + content.ms.combine;
         long = long ? stats.trip - spent > 15 : stats.trip - spent > 60 + spent;
         stats.got++;
