@@ -15,7 +15,7 @@ from PIL import Image
 import jaxprt as prt
 from jaxprt import image, view
 from jaxprt.image.pixels import seen_from_front
-from jaxprt.scene import Camera, Part, Scene, TexturedMaterial, builtin
+from jaxprt.scene import Camera, Part, Scene, TexturedMaterial, builtin, sides
 from jaxprt.scene.environment import rotate
 from jaxprt.view import Server, Session, stages
 from tests.view.test_browser import CANVAS, Hand
@@ -286,7 +286,7 @@ def test_it_starts_at_the_automatic_exposure_of_the_object(hand, systems, lights
     camera = Camera(view_of["eye"], view_of["target"], [0.0, 1.0, 0.0], view_of["angle"], width, height)
     light = list(lights.values())[number]
     color = scene.radiance(light, eye=np.asarray(view_of["eye"]))
-    hidden = Session(systems, environments=lights)._hidden_faces()
+    hidden = sides.hidden_backs(scene.scene)[np.asarray(scene.mesh.region)[np.asarray(scene.mesh.face)[:, 0]]]
     picture = image.render(seen_from_front(scene.mesh, camera, hidden), color, camera)
     expected = float(image.automatic_exposure(picture, coverage=scene.coverage(camera)))
     assert state["light"] == number
