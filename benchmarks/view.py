@@ -2,11 +2,15 @@
 
     python -m benchmarks.view [--quick] [--output FILE]
 
-The embedded scene of 16,778 vertices by 6 lobes with roughness free from .25 to .8, and with one bounce. Each time is
-from the question to the last byte of the answer, over HTTP as the browser's page asks: what Python and the socket take,
-without what the browser needs to draw. `bytes` are those of an answer, whose half floats the error is of. `first` is a
-new process that loads the kept precomputation, from its start to its first answer, with programs that an earlier
-process has compiled. The quick case has no bounce.
+First a process of `jaxprt view`, asked over HTTP as the browser's page asks: from the command to the page, to what a
+browser's GPU needs for colors without shadows, with coarse shadows, and of full quality, and to the end of what is
+compiled ahead. `cold` has neither programs nor precomputation of earlier processes, `programs` has programs, and
+`stored` has both. What the browser itself takes is not included. Without --quick the scene is a file, if
+JAXPRT_DATA names a folder of files.
+
+Then looks, for browsers whose GPU does not shade: the embedded scene by lobes, with direct light, one bounce and two.
+Each time is from the question to the last byte of the answer. `bytes` are those of an answer, whose half floats the
+error is of. The quick case has no bounce.
 """
 
 import dataclasses
@@ -31,14 +35,7 @@ from jaxprt.scene import TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
 from jaxprt.view import messages
 
-_FIRST = """
-import sys, time
-from jaxprt.cli import play
-made, lights = play.ready(play.chosen(["--output", sys.argv[1]]))
-server = play.serve(made, environments=lights)
-print(server.url, flush=True)
-server.wait()
-"""
+_FILES = "scenes/Duck.glb", "env/uffizi_latlong_256x128.hdr"  # in JAXPRT_DATA
 
 
 class Page:
@@ -118,41 +115,87 @@ def radiance(made: prt.RelitScene, light: prt.Environment, state: dict[str, Any]
     return np.asarray(made.radiance(turned, eye=jnp.asarray(state["eye"]), materials=new))
 
 
-def first() -> dict[str, Any]:
-    """A new process with kept precomputation and programs, until its first colors are there."""
-    with tempfile.TemporaryDirectory() as folder:
+class Preparation:
+    """A process of `jaxprt view`, and when the page gets what."""
+
+    def __init__(self, arguments: Sequence[str], folder: str):
+        self.began = time.perf_counter()
         environment = {**os.environ, "XDG_CACHE_HOME": folder, "JAXPRT_KEEP_PROGRAMS": "1"}
-        spent, color = 0.0, np.zeros(0)
-        for _ in range(2):  # the first one computes and compiles
-            began = time.perf_counter()
-            command = [sys.executable, "-c", _FIRST, f"{folder}/store"]
-            process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
-            assert process.stdout is not None
-            page = Page(process.stdout.readline().strip())
-            color = page.look()
-            spent = time.perf_counter() - began
-            page.close()
-            process.terminate()
-            process.wait()
-            process.stdout.close()
-    case = f"first colors of a stored scene, {len(color)} vertices"
-    return {
-        "benchmark": "view",
-        "case": case,
-        "seconds": spent,
-        "compile_seconds": 0.0,
-        "error": None,
-        "bytes": 2 * color.size,
-    }
+        command = [sys.executable, "-m", "jaxprt", "view", "--no-browser", *arguments]
+        self._process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment
+        )
+        assert self._process.stdout is not None
+        self._url = self._process.stdout.readline().split()[1]
+
+    def close(self) -> None:
+        """Ends the process."""
+        self._process.terminate()
+        self._process.wait()
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+
+    def events(self) -> Iterator[tuple[str, float, int]]:
+        """What the page has got, after how many seconds, and bytes of the answers."""
+        place = urllib.parse.urlsplit(self._url)
+        connection = http.client.HTTPConnection(str(place.hostname), place.port, timeout=600)
+
+        def ask(content: dict[str, Any]) -> tuple[dict[str, Any], list[bytes]]:
+            connection.request("POST", place.path + "ask", messages.pack(content, []))
+            return messages.unpack(connection.getresponse().read())
+
+        connection.request("GET", place.path)
+        size = len(connection.getresponse().read())
+        yield "page", time.perf_counter() - self.began, size
+        version, previews = 0, ["no shadows", "coarse shadows", "coarse shadows at all vertices", "no bounces"]
+        while True:
+            state, _ = ask({"kind": "progress"})
+            if state["version"] > version:
+                scene, arrays = ask({"kind": "scene"})
+                _, more = ask({"kind": "page", "system": next(iter(scene["systems"]))})
+                preview, version = not scene["rests"], scene["version"]
+                name = previews[min(version, len(previews)) - 1] if preview else "full quality"
+                yield name, time.perf_counter() - self.began, sum(map(len, arrays + more))
+            elif state["finished"]:
+                yield "programs of first changes", time.perf_counter() - self.began, 0
+                connection.close()
+                return
+            time.sleep(0.05)
+
+
+def preparations(*, quick: bool) -> Iterator[dict[str, Any]]:
+    """From the command to each better scene: cold, with programs, and with stored precomputation too."""
+    data = None if quick else os.environ.get("JAXPRT_DATA")
+    files = [] if data is None else [os.path.join(data, name) for name in _FILES]
+    small = ["--light-size", "8", "--texels", "2"] if quick else []
+    with tempfile.TemporaryDirectory() as folder:
+        store = ["--output", f"{folder}/store"]
+        cases = {"programs": []} if quick else {"cold": [], "programs": store, "stored": store}
+        for case, more in cases.items():
+            process = Preparation([*files, *small, *more], folder)
+            try:
+                for name, seconds, size in process.events():
+                    yield {
+                        "benchmark": "view",
+                        "case": f"{case}: {name}",
+                        "seconds": seconds,
+                        "compile_seconds": 0.0,
+                        "error": None,
+                        "bytes": size,
+                    }
+                    if quick and name == "no shadows":
+                        break
+            finally:
+                process.close()
 
 
 def main(options: Sequence[str] | None = None) -> None:
     arguments = harness.parser(str(__doc__).splitlines()[0]).parse_args(options)
-    for bounces in (0,) if arguments.quick else (0, 1):
+    for line in preparations(quick=arguments.quick):
+        harness.report(line, arguments.output)
+    for bounces in (0,) if arguments.quick else (0, 1, 2):
         for line in hands(bounces, quick=arguments.quick):
             harness.report(line, arguments.output)
-    if not arguments.quick:
-        harness.report(first(), arguments.output)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 import http.client
 import json
 import socket
+import threading
 import urllib.parse
 from types import SimpleNamespace
 
@@ -14,6 +15,7 @@ from jaxprt import files
 from jaxprt.cli import inputs, play
 from jaxprt.cli.main import program
 from jaxprt.view import messages
+from jaxprt.view.progress import Progress
 
 OBJ = "v 0 1 0\nv -1 -0.5 1\nv 1 -0.5 1\nv 0 -0.5 -1\nf 1 2 3\nf 1 3 4\nf 1 4 2\nf 2 4 3\n"
 
@@ -152,6 +154,39 @@ def test_the_page_of_files_is_served(place, monkeypatch, capsys):
     assert list(answers[0]["systems"]) == ["1 lobes", "2 lobes"]
     assert answers[0]["vertices"] == 4
     assert "http://127.0.0.1:" in capsys.readouterr().out
+
+
+def test_what_a_file_lacks_is_told_after_the_page_is_there(place, capsys):
+    (place / "broken.glb").write_bytes(b"glTF and no more")
+    assert main(["view", str(place / "broken.glb"), "--no-browser"]) == 2
+    said = capsys.readouterr()
+    assert "http://127.0.0.1:" in said.out
+    assert "broken.glb" in said.err
+    assert "Traceback" not in said.err
+
+
+def test_ctrl_c_during_the_preparation_ends_it_and_the_command(place, monkeypatch, capsys):
+    began, interrupted, ended = threading.Event(), threading.Event(), threading.Event()
+
+    def prepare(session, chosen):
+        session.report("tracing rays", 0.1)
+        began.set()
+        interrupted.wait(60)
+        try:
+            session.report("tracing rays", 0.2)
+        finally:
+            ended.set()
+
+    def interrupt(self, *, patience):
+        assert began.wait(60)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(play, "prepare", prepare)
+    monkeypatch.setattr(Progress, "wait", interrupt)
+    assert main(["view", "--no-browser"]) == 130
+    assert "jaxprt: stopped; the same command goes on from here" in capsys.readouterr().err
+    interrupted.set()
+    assert ended.wait(60)
 
 
 def test_a_port_that_is_taken_is_refused_before_anything_is_computed(monkeypatch, capsys):
