@@ -16,6 +16,7 @@ error is of. The quick case has no bounce.
 import dataclasses
 import http.client
 import os
+import pathlib
 import subprocess
 import sys
 import tempfile
@@ -128,6 +129,14 @@ class Preparation:
         assert self._process.stdout is not None
         self._url = self._process.stdout.readline().split()[1]
 
+    def processor_seconds(self) -> float | None:
+        """Seconds that the process has computed, on all cores; None where the system does not tell."""
+        try:
+            fields = pathlib.Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            return None
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
     def close(self) -> None:
         """Ends the process."""
         self._process.terminate()
@@ -179,6 +188,7 @@ def preparations(*, quick: bool) -> Iterator[dict[str, Any]]:
                         "benchmark": "view",
                         "case": f"{case}: {name}",
                         "seconds": seconds,
+                        "processor_seconds": process.processor_seconds(),
                         "compile_seconds": 0.0,
                         "error": None,
                         "bytes": size,

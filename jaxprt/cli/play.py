@@ -31,6 +31,7 @@ _STAGES = {
     "visibility": "tracing rays",
     "lamps": "tracing rays to lamps",
     "compress": "compressing what the rays have seen",
+    "response": "computing what surfaces reflect",
     "patches": "tracing light between surfaces",
     "bounce": "tracing the first bounce",
     "bounce 2": "tracing the second bounce",
@@ -167,7 +168,7 @@ class Report:
 
     def __call__(self, label: str, share: float | None = None) -> None:
         """Tells which share of a stage is done, from 0 to 1; None if nobody knows."""
-        stage = _STAGES.get(label, label)
+        stage = _STAGES.get(label) or _STAGES.get(label.split()[0], label)
         self._session.report(stage, share)
         if stage != self._stage:
             self._stage = stage

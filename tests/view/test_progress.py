@@ -8,8 +8,9 @@ import pytest
 from jax._src import compiler
 
 from jaxprt import files
-from jaxprt.view import Session
+from jaxprt.view import Server, Session
 from jaxprt.view.progress import EndedError
+from tests.view.test_browser import CANVAS
 
 
 @pytest.fixture
@@ -190,3 +191,25 @@ def test_after_the_preparation_the_first_changes_compile_no_program(empty, syste
     finally:
         jax.monitoring.unregister_event_duration_listener(count)
     assert not compiled
+
+
+def test_the_page_tells_what_is_done_and_keeps_its_state_when_a_better_scene_comes(browser, empty, systems, lights):
+    server = Server(empty)
+    page = browser.new_page(viewport={"width": 480, "height": 320})
+    page.goto(server.url)
+    root = "document.getElementById('viewer').shadowRoot"
+    empty.report("tracing rays", 0.25)
+    page.wait_for_function(f"() => {root}?.querySelector('.stagetext')?.textContent === 'tracing rays: 25 %'")
+    empty.show({"harmonics": systems["harmonics"]}, environments=lights, preview=True)
+    page.wait_for_function(f"() => {CANVAS}?.stats?.shown >= 0", timeout=120_000)
+    assert not page.evaluate(f"() => {root}.querySelector('.panel').textContent.includes('picture at rest')")
+    changed = {"ball": {"roughness": 0.7}}
+    page.evaluate(f"(materials) => {{ Object.assign({CANVAS}.state, {{ materials, light: 1 }}); }}", changed)
+    empty.show({"harmonics": systems["harmonics"]})
+    page.wait_for_function(f"() => {root}.querySelector('.panel').textContent.includes('picture at rest')")
+    state = page.evaluate(f"() => {CANVAS}.state")
+    assert (state["materials"], state["light"]) == (changed, 1)
+    empty.progress.finish()
+    page.wait_for_function(f"() => {root}.querySelector('.stagetext').hidden", timeout=120_000)
+    page.close()
+    server.close()

@@ -284,7 +284,7 @@ export function mount(root, ask) {
   };
   let controls = null;
   // What Python prepares: the page shows how far it is, and takes each better scene.
-  let unfollow = () => {}, loading = false, panelled = "";
+  let unfollow = () => {}, loading = false, panelled = "", bouncing = false;
   const start = () => {
     unfollow();
     resize();
@@ -293,6 +293,10 @@ export function mount(root, ask) {
       if (content.error) tell(content.error);
       waiting.set("progress", content.finished ? "" : content.stage, content.fraction);
       if (content.version > (scene?.version ?? 0)) load();
+      else if (content.finished && bouncing) {
+        bouncing = false;
+        set({ bounces: true });
+      }
     });
   };
   const load = async () => {
@@ -311,7 +315,9 @@ export function mount(root, ask) {
       // Controls stay as they are where they show the same, because a hand may be at one.
       const controlled = JSON.stringify([loaded.parts.map(({ name, free }) => [name, free]), loaded.lights, Object.keys(loaded.systems), loaded.rests]);
       const had = scene?.systems[state.system]?.bounces, has = loaded.systems[state.system].bounces;
-      if (had !== has) state.bounces = has;
+      // The GPU goes on with direct light until the programs of bounces are compiled.
+      if (had !== has) [bouncing, state.bounces] = [has && gpu !== null && !loaded.finished, has];
+      if (bouncing) state.bounces = false;
       scene = Object.assign(scene ?? {}, loaded);
       bytes = null;
       camera ??= new Camera(scene);
