@@ -319,7 +319,7 @@ export function mount(root, ask) {
       if (had !== has) [bouncing, state.bounces] = [has && gpu !== null && !loaded.finished, has];
       if (bouncing) state.bounces = false;
       scene = Object.assign(scene ?? {}, loaded);
-      bytes = null;
+      [bytes, exposed] = [null, null]; // an automatic exposure is found for each better scene
       camera ??= new Camera(scene);
       drawing.setMesh(scene.position, scene.face, scene.backs);
       if (controlled !== panelled) {
