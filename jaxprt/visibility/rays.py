@@ -179,7 +179,7 @@ class VisibilityJob(blocks.Job):
         size: Edge of the cubemap's faces in texels.
         mesh_key: Fingerprint of the faces and of the chosen vertices.
         mesh_near: Sketches (see `jaxprt.files.arrays.sketch`) of positions, normals and tangents.
-        texels: Largest number of texels along an edge that are traced; None for all. See `jaxprt.Run`.
+        ray_edge: Largest number of texels along an edge that are traced; None for all. See `jaxprt.Run`.
     """
 
     start: np.ndarray
@@ -188,7 +188,7 @@ class VisibilityJob(blocks.Job):
     size: int
     mesh_key: str
     mesh_near: Mapping[str, list[float]]
-    texels: int | None = field(default=None, kw_only=True)
+    ray_edge: int | None = field(default=None, kw_only=True)
 
     @classmethod
     def make(
@@ -261,14 +261,14 @@ class VisibilityJob(blocks.Job):
         """Visibility of a block of vertices, from `fractional`."""
         part = self.part(block)
         start, normal = self.start[part], self.frame[part, 2]
-        if self.texels is None or self.texels >= self.size or self.size % self.texels:
+        if self.ray_edge is None or self.ray_edge >= self.size or self.size % self.ray_edge:
             return fractional(self.rays, start, normal, size=self.size)
-        seen, count = fractional(self.rays, start, normal, size=self.texels, supersample=False)
+        seen, count = fractional(self.rays, start, normal, size=self.ray_edge, supersample=False)
         return _finer(seen, normal, size=self.size), count
 
     def with_texels(self, texels: int) -> "VisibilityJob":
         """The job with rays through larger texels, as `Run.texels` says."""
-        job = replace(self, texels=texels)
+        job = replace(self, ray_edge=texels)
         vars(job)["rays"] = self.rays
         return job
 
