@@ -24,9 +24,13 @@ class Progress:
         self._prepared = self._finished = self._told = False
 
     def report(self, stage: str, share: float | None) -> None:
-        """Sets what is being done, and which share of it is done, from 0 to 1; None if nobody knows."""
+        """Sets what is being done, and which share of it is done, from 0 to 1; None if nobody knows.
+
+        When all of it is done, what follows until the next report makes the scene from it.
+        """
         with self._changed:
-            self._stage, self._share = stage, None if share is None else float(share)
+            done = share is not None and share >= 1
+            self._stage, self._share = ("preparing the scene", None) if done else (stage, share)
 
     def prepared(self) -> None:
         """The scene is complete. What follows makes it only faster."""
