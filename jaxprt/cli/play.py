@@ -166,7 +166,7 @@ class Report:
     def __init__(self, session: Session):
         self._session, self._stage = session, ""
 
-    def __call__(self, label: str, share: float | None = None) -> None:
+    def __call__(self, label: str, share: float | None) -> None:
         """Tells which share of a stage is done, from 0 to 1; None if nobody knows."""
         stage = _STAGES.get(label) or _STAGES.get(label.split()[0], label)
         self._session.report(stage, share)
@@ -178,7 +178,7 @@ class Report:
 def prepare(session: Session, chosen: SimpleNamespace) -> None:
     """Reads files and precomputes their scene by each system, while the session shows what there is so far."""
     report, began = Report(session), time.perf_counter()
-    report(f"reading {', '.join(path.name for path in chosen.files) or 'the embedded scene'}")
+    report(f"reading {', '.join(path.name for path in chosen.files) or 'the embedded scene'}", None)
     # `precompute` divides the meshes, after a preview without division.
     scene = inputs.scene(SimpleNamespace(**vars(chosen) | {"refine": False}), playable=True)
     lights = inputs.lights(chosen)
@@ -188,7 +188,7 @@ def prepare(session: Session, chosen: SimpleNamespace) -> None:
         for system in chosen.system
         for name, recipe in options.recipes(system, chosen, lobes=LOBES).items()
     }
-    report("evaluating materials")
+    report("evaluating materials", None)
     first, (_, recipe) = next(iter(recipes.items()))
     session.show_unshadowed(Unshadowed.of(scene, recipe), name=first, environments=lights)
     systems: dict[str, RelitScene] = {}

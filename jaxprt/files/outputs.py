@@ -189,7 +189,7 @@ def _layer_channels(layers: Mapping[str, Any]) -> dict[str, Float[np.ndarray, "h
     sizes = sorted({values.shape for values in result.values()})
     if len(sizes) != 1:
         got = ", ".join(f"{width} x {height}" for height, width in sizes) or "none"
-        raise ValueError(f"the layers of a file must have one size, got {got}")
+        raise ValueError(f"image must have layers of one size, got {got}")
     return result
 
 

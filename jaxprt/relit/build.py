@@ -143,8 +143,9 @@ def precompute(
         if coarse is not None:
             preview(coarse)
     near = centered(scene)
-    traced = _Traced.of(scene, near, shaded(near.parts, recipes), recipes, size, run)
-    traced.warn()
+    shadings = shaded(near.parts, recipes)
+    _warn(scene, near, shadings)
+    traced = _Traced.of(scene, near, shadings, recipes, size, run)
     direct = traced.relit(**fields)
     if not bounces:
         return direct
@@ -153,6 +154,19 @@ def precompute(
     # One store serves any number of bounces: a larger number resumes from a smaller one.
     target = Target(traced.near.mesh, size=size, run=run.within("scene"))
     return traced.relit(traced.reflected(bounces, target, rays=rays), **fields)
+
+
+def _as_shaded(scene: Scene, shadings: Sequence[Shading]) -> Scene:
+    """The scene with the materials that its systems show."""
+    return dataclasses.replace(scene, parts=list(map(channels.as_shaded, scene.parts, shadings)))
+
+
+def _warn(scene: Scene, near: Scene, shadings: Sequence[Shading]) -> None:
+    """Warns of scenes that look wrong although they are drawn as asked, before rays are traced."""
+    warn.of_gain(near, shadings)
+    warn.of_shells(near)
+    scene = _as_shaded(scene, shadings)
+    warn.of_backs(scene, scene.mesh, default_camera(scene, scene.mesh))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,7 +194,7 @@ class _Traced:
         cls, scene: Scene, near: Scene, shadings: list[Shading], recipes: Sequence[Recipe], size: int, run: Run
     ) -> "_Traced":
         """Traces the rays of a scene."""
-        scene = dataclasses.replace(scene, parts=list(map(channels.as_shaded, scene.parts, shadings)))
+        scene = _as_shaded(scene, shadings)
         parts = groups.kinds(shadings, recipes)
         place = groups.Place.of(scene.counts, parts, [recipes[members[0]].joins for members in parts])
         names = [_file_name(members, scene) for members in place.parts]
@@ -188,13 +202,6 @@ class _Traced:
         systems = _systems(recipes, shadings, targets, place)
         lit = lamps.make(near, shadings, place, systems, targets, scene.point_lights)
         return cls(scene, near, shadings, place, systems, lit)
-
-    def warn(self) -> None:
-        """Warns of scenes that look wrong although they are drawn as asked."""
-        warn.of_gain(self.near, self.shadings)
-        warn.of_shells(self.near)
-        mesh = self.scene.mesh
-        warn.of_backs(self.scene, mesh, default_camera(self.scene, mesh))
 
     def reflected(self, bounces: int | str, target: Target, *, rays: int) -> GroupBounces:
         """Light that the parts reflect onto each other."""

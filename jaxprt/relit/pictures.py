@@ -180,10 +180,10 @@ class PictureView(eqx.Module):
     def remembering(self, arriving: dict[tuple[int, bool], Arriving]) -> "PictureView":
         """The view with what other views of the scene computed of lights, by environment; these must stay in memory."""
 
-        def known_or_new(environment: Environment, direct: Environment | None) -> Arriving:
+        def known_or_new(environment: Environment, direct: Environment | None, share: Any) -> Arriving:
             key = id(environment), direct is None
             if key not in arriving:
-                arriving[key] = self.arriving(environment, direct)
+                arriving[key] = self.arriving(environment, direct, share)
             return arriving[key]
 
         return dataclasses.replace(self, arriving=known_or_new)
@@ -192,12 +192,12 @@ class PictureView(eqx.Module):
         self, environment: Environment, between: Between, *, share: Float[np.ndarray, " n"] | None = None
     ) -> "PictureLight":
         """What arrives under an environment and a share of each lamp."""
-        traced, more = _traced_light(self, environment), () if share is None else (share,)
-        arriving = finished(self.arriving(environment, None if traced is None else traced.rest, *more), between)
+        traced = _traced_light(self, environment)
+        arriving = finished(self.arriving(environment, None if traced is None else traced.rest, share), between)
         reflections = ()
         if self.reflected is not None:
             # What rays hit is shaded with interpolated visibility, in the whole light.
-            whole = arriving if traced is None else self.arriving(environment, None, *more)
+            whole = arriving if traced is None else self.arriving(environment, None, share)
             reflections = tuple(self.reflected.radiance(self.stage, whole))
         return PictureLight(arriving, traced, reflections, share)
 
@@ -265,7 +265,7 @@ class SceneLighting(eqx.Module):
     appearances: dict[str, Appearance]
 
     def __call__(
-        self, environment: Environment, direct: Environment | None = None, share: Float[np.ndarray, " n"] | None = None
+        self, environment: Environment, direct: Environment | None, share: Float[np.ndarray, " n"] | None
     ) -> Arriving:
         """The arriving light."""
         lights = split(self.scene.lamps, self.materials)[1]
