@@ -13,6 +13,7 @@ Each time is from the question to the last byte of the answer. `bytes` are those
 error is of. The quick case has no bounce.
 """
 
+import contextlib
 import dataclasses
 import http.client
 import os
@@ -22,7 +23,7 @@ import sys
 import tempfile
 import time
 import urllib.parse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -144,7 +145,7 @@ class Preparation:
         assert self._process.stdout is not None
         self._process.stdout.close()
 
-    def events(self) -> Iterator[tuple[str, float, int]]:
+    def events(self) -> Generator[tuple[str, float, int], None, None]:
         """What the page has got, after how many seconds, and bytes of the answers."""
         place = urllib.parse.urlsplit(self._url)
         connection = http.client.HTTPConnection(str(place.hostname), place.port, timeout=600)
@@ -153,23 +154,23 @@ class Preparation:
             connection.request("POST", place.path + "ask", messages.pack(content, []))
             return messages.unpack(connection.getresponse().read())
 
-        connection.request("GET", place.path)
-        size = len(connection.getresponse().read())
-        yield "page", time.perf_counter() - self.began, size
-        version, previews = 0, ["no shadows", "coarse shadows", "coarse shadows at all vertices", "no bounces"]
-        while True:
-            state, _ = ask({"kind": "progress"})
-            if state["version"] > version:
-                scene, arrays = ask({"kind": "scene"})
-                _, more = ask({"kind": "page", "system": next(iter(scene["systems"]))})
-                preview, version = not scene["rests"], scene["version"]
-                name = previews[min(version, len(previews)) - 1] if preview else "full quality"
-                yield name, time.perf_counter() - self.began, sum(map(len, arrays + more))
-            elif state["finished"]:
-                yield "programs of first changes", time.perf_counter() - self.began, 0
-                connection.close()
-                return
-            time.sleep(0.05)
+        with contextlib.closing(connection):
+            connection.request("GET", place.path)
+            size = len(connection.getresponse().read())
+            yield "page", time.perf_counter() - self.began, size
+            version, previews = 0, ["no shadows", "coarse shadows", "coarse shadows at all vertices", "no bounces"]
+            while True:
+                state, _ = ask({"kind": "progress"})
+                if state["version"] > version:
+                    scene, arrays = ask({"kind": "scene"})
+                    _, more = ask({"kind": "page", "system": next(iter(scene["systems"]))})
+                    preview, version = not scene["rests"], scene["version"]
+                    name = previews[min(version, len(previews)) - 1] if preview else "full quality"
+                    yield name, time.perf_counter() - self.began, sum(map(len, arrays + more))
+                elif state["finished"]:
+                    yield "programs of first changes", time.perf_counter() - self.began, 0
+                    return
+                time.sleep(0.05)
 
 
 def preparations(*, quick: bool) -> Iterator[dict[str, Any]]:
@@ -182,8 +183,9 @@ def preparations(*, quick: bool) -> Iterator[dict[str, Any]]:
         cases = {"programs": []} if quick else {"cold": [], "programs": store, "stored": store}
         for case, more in cases.items():
             process = Preparation([*files, *small, *more], folder)
+            events = process.events()
             try:
-                for name, seconds, size in process.events():
+                for name, seconds, size in events:
                     yield {
                         "benchmark": "view",
                         "case": f"{case}: {name}",
@@ -196,6 +198,7 @@ def preparations(*, quick: bool) -> Iterator[dict[str, Any]]:
                     if quick and name == "no shadows":
                         break
             finally:
+                events.close()
                 process.close()
 
 

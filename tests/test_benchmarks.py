@@ -94,12 +94,12 @@ def test_quick_case_reports_each_measurement_with_its_error_and_peer(name, small
     output = tmp_path / "lines.jsonl"
     importlib.import_module(f"benchmarks.{name}").main(["--quick", "--output", str(output)])
     lines = [json.loads(line) for line in output.read_text().splitlines()]
-    assert lines
+    assert any(line["error"] is not None for line in lines)
     for line in lines:
         assert line["benchmark"] == name
         assert line["seconds"] > 0
         assert line["bytes"] > 0
-        assert line["error"] <= MOST_ERROR[name]
+        assert line["error"] is None or line["error"] <= MOST_ERROR[name]
         if "peer" not in line:
             continue
         assert line["ratio"] == pytest.approx(line["peer_seconds"] / line["seconds"])
