@@ -102,7 +102,7 @@ _MEMORY = 1 << 28  # bytes of pictures that are held at once
     "--layers",
     group="Output",
     type=options.Several(click.Choice(list(outputs.LAYERS))),
-    default="color,alpha",
+    default=None,
     help="Layers of EXR files.  [default: color,alpha]",
 )
 @option(
@@ -141,13 +141,13 @@ def command(**arguments: Any) -> None:
     with options.reserve_stdout(chosen.as_json):
         summary = render(chosen)
     text = (
-        f"jaxprt: {summary['pictures']} pictures of {summary['scenes']} scenes in {chosen.output}, "
+        f"jaxprt: {summary['pictures']} pictures, scenes: {summary['scenes']}, in {chosen.output}; "
         f"{summary['rate']:.1f} new ones a second"
     )
     options.tell(summary, text, as_json=chosen.as_json)
     if summary["failed"]:
         words = "; ".join(f"{name}: {why}" for name, why in summary["failed"].items())
-        raise click.ClickException(f"{len(summary['failed'])} scenes failed: {words}")
+        raise click.ClickException(f"scenes that failed: {len(summary['failed'])}; {words}")
 
 
 def render(chosen: SimpleNamespace) -> dict[str, Any]:
@@ -161,9 +161,11 @@ def render(chosen: SimpleNamespace) -> dict[str, Any]:
     relight.make_folder(chosen.output)
     _check_settings(chosen, list(lights))
     failed, new, began = {}, 0, time.monotonic()
-    for name, path in scenes.items():
+    for number, (name, path) in enumerate(scenes.items(), 1):
         try:
-            new += _render_scene(name, path, lights, cameras, chosen)
+            count = _render_scene(name, path, lights, cameras, chosen)
+            click.echo(f"jaxprt: {name} is done, scene {number} of {len(scenes)}: {count} new pictures", err=True)
+            new += count
         except (ValueError, TypeError, OSError, MemoryError, RuntimeError) as error:
             failed[name] = options.message_of(error)
             click.echo(f"jaxprt: {name} failed: {failed[name]}", err=True)
@@ -192,9 +194,12 @@ def _inputs(chosen: SimpleNamespace) -> tuple[dict[str, Path], dict[str, Environ
         raise ValueError("a dataset needs an environment, got none: name EXR or HDR files, or --lights PATTERN")
     if len(chosen.system) > 1 or len(chosen.lobes or ()) > 1:
         raise ValueError("a dataset takes one system and one number of lobes, got several")
+    if chosen.layers is not None and chosen.form != "exr":
+        raise ValueError(f"--layers needs --format exr, got {chosen.form}")
     low, *high = chosen.elevations
     if len(high) != 1 or not low <= high[0]:
-        raise ValueError(f"--elevations must be LOW,HIGH, got {','.join(map(str, chosen.elevations))}")
+        got = ",".join(f"{angle:g}" for angle in chosen.elevations)
+        raise ValueError(f"--elevations must be two angles LOW,HIGH, the lower one first, got {got}")
     named = SimpleNamespace(files=lights, light_size=chosen.light_size, turn=(0.0,))
     names = inputs.unique([path.stem for path in scenes])
     return dict(zip(names, scenes, strict=True)), inputs.lights(named)
@@ -348,7 +353,7 @@ def _draw(
         for view in range(len(cameras))
     }
     total = sum(map(len, missing.values()))
-    layers = chosen.layers if chosen.form == "exr" else ("color", "alpha")
+    layers = chosen.layers or ("color", "alpha")
     with tqdm.tqdm(total=total, desc=name, unit="picture", disable=not sys.stderr.isatty()) as bar:
         for numbers in sorted(set(map(tuple, missing.values()))):  # all lights, as a rule
             views = [view for view, some in missing.items() if tuple(some) == numbers and numbers]

@@ -170,11 +170,16 @@ def write_exr(
         _compare(new, np.stack(list(channels.values()), -1), "float", names=list(channels))
 
 
+def is_layer_name(name: str) -> bool:
+    """Whether a layer of a file can have this name."""
+    return re.fullmatch(r"[A-Za-z0-9 _-]+", name) is not None
+
+
 def _layer_channels(layers: Mapping[str, Any]) -> dict[str, Float[np.ndarray, "h w"]]:
     """The channels of the layers of a picture."""
     result: dict[str, Any] = {}
     for name, layer in layers.items():
-        if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9 _-]+", name):
+        if not isinstance(name, str) or not is_layer_name(name):
             raise ValueError(f"names of layers must be of letters, digits, spaces, - and _, got {name!r}")
         what = f"the layer {name!r}"
         require.real(what, layer)

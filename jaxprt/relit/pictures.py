@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxprt import require
 from jaxprt.compile import Between, compile_time, finished, jit, known, promoted, put
+from jaxprt.files import outputs
 from jaxprt.image import raster
 from jaxprt.image.pixels import Pixels, visible_points
 from jaxprt.relit import canvas, curvature, groups, lamplight, shadows, tracing
@@ -33,6 +34,8 @@ from jaxprt.scene import Camera, Environment
 from jaxprt.scene.points import Points
 from jaxprt.systems.lamps import LampTransport
 
+_TAKEN = ("rest", "background", *outputs.LAYERS)  # names that regions cannot have
+_ROUNDED = 1e-4  # of sums of shares
 # Samples that are drawn in each drawn pixel, and edge in drawn pixels of a pixel, by samples of a pixel.
 SAMPLES = {1: (1, 1), 4: (4, 1), 16: (4, 2)}
 
@@ -161,7 +164,7 @@ class PictureView(eqx.Module):
                 0 to 1 as the environment has texels.
         """
         _check_light("the light", environment)
-        parts = _regions(environment, {} if regions is None else regions, (*self.lamps, "rest", "background"))
+        parts = _regions(environment, {} if regions is None else regions, (*self.lamps, *_TAKEN))
         black = Environment(jnp.zeros_like(environment.radiance))
         none, alone = np.zeros(len(self.lamps)), np.eye(len(self.lamps))
         whole = self._light(environment, None)  # the first one, which rays are traced for
@@ -323,8 +326,11 @@ def _regions(environment: Environment, regions: Any, taken: Sequence[str]) -> di
     require.kind("the regions", regions, Mapping, source="a dictionary from names to shares of texels")
     shape, result = list(environment.radiance.shape[:3]), {}
     for name, share in regions.items():
-        if not isinstance(name, str) or name in taken:
-            raise ValueError(f"a region must have a name other than {', '.join(taken)}, got {name!r}")
+        if not isinstance(name, str) or not outputs.is_layer_name(name) or name in taken:
+            raise ValueError(
+                f"a region must have a name of letters, digits, spaces, - and _, other than {', '.join(taken)}, "
+                f"got {name!r}"
+            )
         what = f"the share of the region {name!r}"
         require.array(what, share, "6 n n")
         if list(share.shape) != shape:
@@ -333,6 +339,9 @@ def _regions(environment: Environment, regions: Any, taken: Sequence[str]) -> di
         if not (float(jnp.min(share)) >= 0 and float(jnp.max(share)) <= 1):
             raise ValueError(f"{what} must be from 0 to 1, got {float(jnp.min(share)):g} to {float(jnp.max(share)):g}")
         result[name] = Environment(environment.radiance * jnp.asarray(share, environment.radiance.dtype)[..., None])
+    whole = sum(np.asarray(share) for share in regions.values())
+    if np.max(whole) > 1 + _ROUNDED:
+        raise ValueError(f"the shares of regions must add up to at most 1 in each texel, got {np.max(whole):g}")
     return result
 
 

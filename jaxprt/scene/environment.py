@@ -497,8 +497,9 @@ def disk_share(direction: ArrayLike | Sequence[float], *, angle: float, size: in
     Raises:
         ValueError: The direction is zero, or the angle is not between 1e-4 and pi.
     """
-    way = np.asarray(_toward(direction), float)
-    return np.clip(panorama.disk_texels(way, _angle(angle), size), 0, 1)
+    require.number("angle", angle, 1e-4, high=np.pi)
+    require.count("size", size, least=1)
+    return np.clip(panorama.disk_texels(_toward(direction), angle, size), 0, 1)
 
 
 def _direction(value: Any) -> Array:

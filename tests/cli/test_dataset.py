@@ -127,7 +127,7 @@ def test_cameras_come_from_a_file_and_shards_hold_pictures_with_their_lines(plac
 def test_a_scene_that_fails_is_named_and_does_not_stop_others(place, tmp_path):
     result = run(place, tmp_path / "set", "--views", "1", meshes=("bad.obj", "one.obj"), lights="sky*")
     assert result.exit_code == 1
-    assert "1 scenes failed: bad: " in result.output
+    assert "scenes that failed: 1; bad: " in result.output
     assert (tmp_path / "set" / "one" / "0000_sky.exr").exists()
 
 
@@ -136,8 +136,9 @@ def test_a_scene_that_fails_is_named_and_does_not_stop_others(place, tmp_path):
     [
         ((), {"meshes": ()}, "a dataset needs a mesh"),
         ((), {"lights": "*.hdr"}, "matches no file"),
-        (("--elevations", "50,10"), {}, "--elevations must be LOW,HIGH"),
-        (("--elevations", "50"), {}, "--elevations must be LOW,HIGH"),
+        (("--elevations", "50,10"), {}, "--elevations must be two angles LOW,HIGH, the lower one first, got 50,10"),
+        (("--elevations", "50"), {}, "--elevations must be two angles"),
+        (("--format", "png", "--layers", "depth"), {}, "--layers needs --format exr, got png"),
         (("--system", "lobe,harmonic"), {}, "takes one system"),
         (("--views", "0"), {}, "must be a whole number from 1 to 100000"),
     ],

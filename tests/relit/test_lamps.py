@@ -112,11 +112,13 @@ def test_layers_by_light_are_pictures_of_their_light_alone_and_add_up(close):
     ("regions", "words"),
     [
         ({"panel": np.ones((6, 8, 8))}, "other than panel, bulb, rest, background"),
+        ({"a/b": np.ones((6, 8, 8))}, "a name of letters"),
+        ({"one": np.ones((6, 8, 8)), "two": np.ones((6, 8, 8))}, "add up to at most 1 in each texel, got 2"),
         ({"sun": np.ones((6, 4, 4))}, "must have the"),
         ({"sun": np.full((6, 8, 8), 2.0)}, "must be from 0 to 1, got 2 to 2"),
         ({"sun": np.full((6, 8, 8), np.nan)}, "finite"),
     ],
-    ids=["name", "size", "range", "nan"],
+    ids=["name", "letters", "overlap", "size", "range", "nan"],
 )
 def test_regions_that_are_none_are_refused(regions, words):
     with pytest.raises(ValueError, match=words):

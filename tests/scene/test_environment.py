@@ -572,6 +572,12 @@ def test_the_share_of_a_disk_has_its_solid_angle_around_its_direction(angle):
     assert share.max() <= 1
 
 
+@pytest.mark.parametrize("angle", [0.0, 9.0])
+def test_disks_without_an_angle_are_refused(angle):
+    with pytest.raises(ValueError, match="angle must be at least 0.0001"):
+        environment.disk_share([0.0, 1.0, 0.0], angle=angle, size=8)
+
+
 def test_lights_of_another_size_have_the_same_flux():
     light = Environment(jnp.asarray(np.random.default_rng(0).uniform(size=(6, 8, 8, 3)), jnp.float32))
     for size in (2, 8, 32):

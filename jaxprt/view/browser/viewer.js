@@ -42,6 +42,7 @@ export function mount(root, ask) {
       moved();
     }
   };
+  let refined = 0; // samples of the pixels that the status line tells
   let fresh = false; // whether more has changed than what pixels show
   const again = () => { if (!wanted && !closed) wanted = requestAnimationFrame(draw); };
   const redraw = () => { fresh = true; again(); };
@@ -50,6 +51,7 @@ export function mount(root, ask) {
     if (!camera || closed || drawing.gl.isContextLost()) return;
     const appears = drawing.draw(camera, state, scene.center, now, state.still && scene.rests.length > 0, fresh);
     fresh = false;
+    if (drawing.gpu && gpu.stats.samples !== refined) { refined = gpu.stats.samples; describe(); }
     controls?.look(camera.azimuth);
     stats.draws++;
     if (appears) again();
@@ -89,6 +91,11 @@ export function mount(root, ask) {
   };
   // Whether the GPU shades the present state. A slow one leaves it to Python, if that is quicker.
   const shades = () => gpu !== null && asked === state.system && !state.bounces && !gpu.piece.fixed(state.materials) && !(gpu.slow && scene.rests.length && (looked < TRIES || stats.trip < 2 * gpu.stats.ms));
+  const describe = () => {
+    const { level, samples, ms } = gpu.stats;
+    const size = samples ? `pixels of ${samples} sample${samples > 1 ? "s" : ""}` : level ? (level === 1 ? "pixels" : `pixels of ${level} x ${level}`) : "vertices";
+    line.textContent = `${size} by the browser's GPU${ms ? `, ${ms.toFixed(0)} ms` : ""} · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}`;
+  };
   const shade = () => {
     stats.sent++;
     gpu.change(message("look"));
@@ -98,8 +105,7 @@ export function mount(root, ask) {
     }
     Object.assign(stats, { got: stats.got + 1, shown: seq });
     tell("");
-    const size = gpu.stats.level ? (gpu.stats.level === 1 ? "pixels" : `pixels of ${gpu.stats.level} x ${gpu.stats.level}`) : "vertices";
-    line.textContent = `${size} by the browser's GPU${gpu.stats.ms ? `, ${gpu.stats.ms.toFixed(0)} ms` : ""} · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}`;
+    describe();
     redraw();
     sky();
     stillTimer = setTimeout(rested, 250);
@@ -181,11 +187,11 @@ export function mount(root, ask) {
   // At rest: the picture at pixels, then the exact one. Where they take long a coarse one comes first. The first picture
   // of a size does not count: its programs are compiled. Python gives up what it is at when the next look comes.
   const still = async () => {
-    if (!state.still || !scene.rests.length || stillBusy || closed || flying) return;
+    if (!(state.still || state.exact) || !scene.rests.length || stillBusy || closed || flying) return;
     stillBusy = true;
     const own = seq, size = { width: canvas.width, height: canvas.height }, name = `${size.width} ${size.height}`;
     if (rest.size !== name) rest = { size: name, made: 0, ms: 0 };
-    const steps = rest.made > 1 && rest.ms > SLOW ? [["still", true], ["still", false]] : [["still", false]];
+    const steps = !state.still ? [] : rest.made > 1 && rest.ms > SLOW ? [["still", true], ["still", false]] : [["still", false]];
     if (state.exact) steps.push(["exact", true], ["exact", false]);
     try {
       for (const [kind, coarse] of steps) {
@@ -324,6 +330,7 @@ export function mount(root, ask) {
       drawing.setMesh(scene.position, scene.face, scene.backs);
       if (controlled !== panelled) {
         controls = panelOf(panel, scene, state, { set, expose, automatic, map, moved, open: drop });
+        if (root.parentElement === document.body && document.activeElement === document.body) canvas.focus({ preventScroll: true }); // a page of the viewer alone: keys work at once
         [panelled, skyKey] = [controlled, {}];
       }
       controls.show();
