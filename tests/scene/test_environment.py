@@ -574,7 +574,7 @@ def test_the_share_of_a_disk_has_its_solid_angle_around_its_direction(angle):
 
 @pytest.mark.parametrize("angle", [0.0, 9.0])
 def test_disks_without_an_angle_are_refused(angle):
-    with pytest.raises(ValueError, match="angle must be at least 0.0001"):
+    with pytest.raises(ValueError, match="angle must be at least"):
         environment.disk_share([0.0, 1.0, 0.0], angle=angle, size=8)
 
 
