@@ -109,13 +109,7 @@ _MEMORY = 1 << 28  # bytes of pictures that are held at once
     "--shards", group="Output", is_flag=True, help="Pack the pictures of each scene into a tar file for WebDataset."
 )
 @options.systems(("lobe", "harmonic", "separable", "dynamic"), default="lobe", words="One system.  [default: lobe]")
-@option(
-    "--bounces",
-    group="System",
-    type=options.Bounces(),
-    default="0",
-    help='Number of bounces between parts, or "all".  [default: 0]',
-)
+@options.no_bounces
 @options.recipe
 @options.folder("Folder for the pictures.", default="dataset")
 @options.as_json
@@ -246,7 +240,7 @@ class _Light:
     """A light of a scene.
 
     Attributes:
-        name: Its name in files.
+        name: Name in the names of files.
         source: Name of the environment.
         turn: Angle in degrees by which it is rotated about the vertical.
         environment: The rotated light.

@@ -50,13 +50,7 @@ _BAKED, _TRANSFER = "baked", "gltf"  # formats of *.glb
     help="Degree of the harmonics of the transfer in *.glb.",
 )
 @options.systems(("lobe", "harmonic", "dynamic"), default="lobe", words="Of pages and scenes.  [default: lobe]")
-@option(
-    "--bounces",
-    group="System",
-    type=options.Bounces(),
-    default="0",
-    help='Number of bounces between parts, or "all". Pages reflect their light diffusely.  [default: 0]',
-)
+@options.no_bounces
 @options.few_sizes
 @option(
     "--most",

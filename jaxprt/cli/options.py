@@ -451,6 +451,13 @@ _more_sizes = together(
 )
 recipe = together(few_sizes, _more_sizes)
 bounces = option("--bounces", group="System", type=Bounces(), help='Number of bounces between parts, or "all".')
+no_bounces = option(
+    "--bounces",
+    group="System",
+    type=Bounces(),
+    default="0",
+    help='Number of bounces between parts, or "all".  [default: 0]',
+)
 as_json = option("--json", "as_json", group="Output", is_flag=True, help="Print the result as JSON on stdout.")
 
 

@@ -44,13 +44,7 @@ _STAGES = {
 @options.systems(
     ("lobe", "harmonic", "dynamic"), default="lobe", words="One, or several to switch by a key.  [default: lobe]"
 )
-@option(
-    "--bounces",
-    group="System",
-    type=options.Bounces(),
-    default="0",
-    help='Number of bounces between parts, or "all".  [default: 0]',
-)
+@options.no_bounces
 @options.few_sizes
 @options.folder("Folder that keeps precomputed data for later runs.")
 @option(

@@ -18,6 +18,7 @@ from jaxprt.scene.environment import resized
 
 _HELD = 3  # arrays of the size of a picture that are held for each picture while it is made
 _BYTES = 16  # of a pixel of four channels
+_REMEMBERED = 64  # most lights whose arriving light is held for all views
 
 
 class PictureBlock(NamedTuple):
@@ -35,7 +36,7 @@ class PictureBlock(NamedTuple):
 
 
 def check(environments: Any, cameras: Any) -> None:
-    """Refuses what are no lists of lights and cameras.
+    """Refuses values that are not lists of lights and cameras.
 
     Raises:
         TypeError: An argument is not a list, or holds something else.
@@ -117,7 +118,7 @@ def blocks(
             if number + 1 < len(cameras):
                 following = pool.submit(view_of, cameras[number + 1])
             count = lights_at_once(camera, memory=memory, layers=layers)
-            keeps = count >= len(environments)
+            keeps = len(environments) <= min(count, _REMEMBERED)
             for first in range(0, len(environments), count):
                 lit = view.remembering(remembered if keeps else {})
                 chosen = environments[first : first + count]

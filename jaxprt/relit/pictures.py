@@ -184,9 +184,11 @@ class PictureView(eqx.Module):
         """The view with what other views of the scene computed of lights, by environment; these must stay in memory."""
 
         def known_or_new(environment: Environment, direct: Environment | None, share: Any) -> Arriving:
+            if share is not None:
+                return self.arriving(environment, direct, share)
             key = id(environment), direct is None
             if key not in arriving:
-                arriving[key] = self.arriving(environment, direct, share)
+                arriving[key] = self.arriving(environment, direct, None)
             return arriving[key]
 
         return dataclasses.replace(self, arriving=known_or_new)

@@ -491,7 +491,7 @@ def disk_share(direction: ArrayLike | Sequence[float], *, angle: float, size: in
 
     Args:
         direction: Direction towards the center of the disk, in world coordinates.
-        angle: Its angular radius in radians.
+        angle: Angular radius of the disk in radians.
         size: Texels along the edge of the light's faces.
 
     Raises:

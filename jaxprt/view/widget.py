@@ -28,8 +28,8 @@ _STYLE = """<style>
 class Viewer(anywidget.AnyWidget):
     """A viewer in a notebook cell.
 
-    Its own threads compute the answers, so that full-quality pictures and files block neither looks nor the kernel. At
-    most one full-quality picture is computed at a time.
+    Threads of the widget compute the answers. Full-quality pictures and files therefore block neither looks nor the
+    kernel. At most one full-quality picture is computed at a time.
 
     Attributes:
         session: The session that it shows.

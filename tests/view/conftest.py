@@ -8,7 +8,8 @@ import pytest
 
 import jaxprt as prt
 from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial, builtin
-from jaxprt.view import Session
+from jaxprt.view import Server, Session
+from tests.view.hand import Hand
 
 SIZE = 8
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -78,3 +79,18 @@ def look():
         "materials": {},
         "stops": None,
     }
+
+
+@pytest.fixture
+def server(session):
+    made = Server(session)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def hand(browser, server):
+    made = Hand(browser, server.url)
+    yield made
+    made.page.close()
+    assert not made.errors

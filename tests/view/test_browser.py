@@ -3,13 +3,11 @@
 Headless Chromium, found as `chromium`; skipped where there is none, unless JAXPRT_BROWSER_REQUIRED is set.
 """
 
-import io
 import threading
 import time
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import jaxprt as prt
 from jaxprt import files, image
@@ -18,79 +16,8 @@ from jaxprt.scene import Camera, Environment
 from jaxprt.scene.environment import rotate
 from jaxprt.systems import standard
 from jaxprt.view import Server, Session
+from tests.view.hand import CANVAS, TOLD, Hand
 from tests.view.peers import Proxy
-
-CANVAS = "document.querySelector('#viewer').shadowRoot.querySelector('.canvas')"
-WIDTH = 584  # 320 for the picture, and the panel
-TOLD = "document.querySelector('#viewer').shadowRoot.querySelector('.told').textContent"
-
-
-class Hand:
-    """A tab that shows a viewer."""
-
-    def __init__(self, browser, url):
-        self.page = browser.new_page(viewport={"width": WIDTH, "height": 320})
-        self.errors = []
-        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.goto(url)
-        self.wait("shown >= 0 && stats.shown === stats.seq")
-
-    def stats(self):
-        return self.page.evaluate(f"() => ({CANVAS}).stats")
-
-    def state(self):
-        return self.page.evaluate(f"() => ({CANVAS}).state")
-
-    def camera(self):
-        return self.page.evaluate(f"() => {{ const c = ({CANVAS}).camera(); return {{ ...c, eye: c.eye }}; }}")
-
-    def wait(self, condition, seconds=60):
-        """Until something is true of the counters."""
-        self.page.wait_for_function(
-            f"() => {{ const stats = ({CANVAS})?.stats; return stats && stats.{condition}; }}", timeout=1000 * seconds
-        )
-
-    def settle(self):
-        self.wait("shown === stats.seq")
-
-    def still(self):
-        """Until the picture at rest has faded in."""
-        before = self.stats()["stills"]
-        self.settle()
-        self.wait(f"stills > {before}")
-        drawn = -1
-        while drawn != (now := self.stats()["draws"]):
-            drawn = now
-            time.sleep(0.5)
-
-    def drag(self, start, end, steps=5, button="left"):
-        self.page.mouse.move(*start)
-        self.page.mouse.down(button=button)
-        self.page.mouse.move(*end, steps=steps)
-        self.page.mouse.up(button=button)
-        self.settle()
-
-    def pixels(self):
-        """What the canvas shows, in [0, 1], read from its drawing."""
-        text = self.page.evaluate(f"() => ({CANVAS}).toDataURL('image/png')")
-        import base64
-
-        return np.asarray(Image.open(io.BytesIO(base64.b64decode(text.partition(",")[2]))).convert("RGB")) / 255
-
-
-@pytest.fixture
-def server(session):
-    made = Server(session)
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def hand(browser, server):
-    made = Hand(browser, server.url)
-    yield made
-    made.page.close()
-    assert not made.errors
 
 
 def drawn(hand, systems, lights, shadows="rays"):

@@ -18,7 +18,7 @@ from jaxprt.image.pixels import seen_from_front
 from jaxprt.scene import Camera, Part, Scene, TexturedMaterial, builtin, sides
 from jaxprt.scene.environment import rotate
 from jaxprt.view import Server, Session, stages
-from tests.view.test_browser import CANVAS, Hand
+from tests.view.hand import CANVAS, Hand
 
 ROOT = "document.querySelector('#viewer').shadowRoot"
 EXPOSURE = 0.15  # stops: bytes, and the viewer's samples of a pixel
@@ -52,21 +52,6 @@ FOCUSED = f"""() => {{
 }}"""
 OPENED = f"""() => [...{ROOT}.querySelectorAll('details.part[open]')]
   .map((part) => part.querySelector('summary').textContent)"""
-
-
-@pytest.fixture
-def server(session):
-    made = Server(session)
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def hand(browser, server):
-    made = Hand(browser, server.url)
-    yield made
-    made.page.close()
-    assert not made.errors
 
 
 @pytest.fixture

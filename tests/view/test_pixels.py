@@ -20,7 +20,7 @@ from jaxprt.view import Server, Session, messages, stages
 from jaxprt.view import browser as modules
 from jaxprt.view.content import page_content
 from jaxprt.view.reduced import PageScene
-from tests.view.test_browser import CANVAS, TOLD, Hand
+from tests.view.hand import CANVAS, TOLD, Hand
 
 SIZE = 8  # texels along a face's edge of lights
 WIDTH, HEIGHT = 96, 72

@@ -10,7 +10,7 @@ from jax._src import compiler
 from jaxprt import files
 from jaxprt.view import Server, Session
 from jaxprt.view.progress import EndedError
-from tests.view.test_browser import CANVAS
+from tests.view.hand import CANVAS
 
 
 @pytest.fixture
