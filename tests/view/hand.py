@@ -17,6 +17,7 @@ class Hand:
 
     def __init__(self, browser, url):
         self.page = browser.new_page(viewport={"width": WIDTH, "height": 320})
+        self.page.set_default_timeout(60_000)  # two workers may take all cores
         self.errors = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.goto(url)

@@ -406,6 +406,7 @@ def test_the_page_works_behind_a_proxy_with_a_path(browser, session):
 def test_the_page_displays_colors_by_the_tone_curves_of_python(hand):
     """The canvas without a picture at rest and a background shows vertex colors by each curve."""
     hand.page.evaluate(f"() => Object.assign(({CANVAS}).state, {{ still: false, background: false }})")
+    hand.drag((60, 60), (66, 60))  # drops a picture at rest that came before
     place = "document.querySelector('#viewer').shadowRoot.querySelectorAll('select')"
     shown = {}
     for number, tone in enumerate(tonemap.TONES):
