@@ -140,6 +140,10 @@ class BrightTexels(VertexSystem):
         bright = texel_radiance(brdf, view.frame, view.wo, texels, self.points, view.blend, **options)
         return self.system.combine(light.rest, view.rest) + bright
 
+    def diffuse_albedo(self, view: BrightView) -> Float[Array, "v c"]:
+        """The albedo of the underlying system."""
+        return self.system.diffuse_albedo(view.rest)
+
     def at(self, points: Points) -> "BrightTexels":
         """The system at points; see `System.at`."""
         return eqx.tree_at(

@@ -115,6 +115,19 @@ class System(eqx.Module):
         """Whether surfaces are ideally diffuse: radiance is linear in the light that arrives at the vertices."""
         return False
 
+    def diffuse_albedo(self, view: PyTree) -> Float[Array, "v c"]:
+        """Albedo of the diffuse response, by which irradiance / pi becomes radiance.
+
+        Args:
+            view: The result of `view`, which ideally diffuse systems take for the albedo itself.
+
+        Raises:
+            TypeError: The system has no diffuse response apart from others.
+        """
+        if not self.matte:
+            raise TypeError(f"{type(self).__name__} has no diffuse response apart from others")
+        return view
+
     @property
     def shared_light(self) -> tuple | None:
         """Key of the result of `light`: systems with equal keys can share it. None if it cannot be shared."""

@@ -19,6 +19,7 @@ from jaxprt.relit.groups import Place
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Part, Scene, TexturedMaterial
 from jaxprt.systems import axes, standard
+from jaxprt.systems.bounces import exported
 from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.lobe.exported import lobe_description, lobe_entries
@@ -26,7 +27,6 @@ from jaxprt.systems.lobe.pyramid import Scales
 from jaxprt.systems.protocol import Blend, Exported, System
 from jaxprt.systems.standard.layered import BASE
 from jaxprt.view import reflected
-from jaxprt.view.reflected import ReflectingSystem
 
 FIRST = 2  # finest scale of visibility that is stored as bytes
 MOST_BYTES = 2**27  # largest buffer that graphics cards accept
@@ -144,7 +144,7 @@ class PageScene:
         """The scene with only some of what bounces and lamps add; the form of the arrays stays."""
         if self.reflected is None:
             return self
-        keep = np.array([*[bounces] * (reflected.ROWS - 1), lamps], float)[:, None, None]
+        keep = np.array([*[bounces] * (exported.ROWS - 1), lamps], float)[:, None, None]
         added = [rows * keep[: len(rows)] for rows in self.reflected]
         return dataclasses.replace(self, reflected=added)
 
@@ -160,7 +160,7 @@ class PageScene:
         if self.reflected is not None:
             pairs = zip(systems, self.reflected, strict=True)
             systems = [
-                ReflectingSystem(system, put(rows.astype(jnp.result_type(float)))) if len(rows) else system
+                exported.ReflectingSystem(system, put(rows.astype(jnp.result_type(float)))) if len(rows) else system
                 for system, rows in pairs
             ]
         return RelitScene(self.scene, self.shading, Place.apart(self.scene.counts), systems)

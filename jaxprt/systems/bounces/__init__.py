@@ -1,6 +1,6 @@
 """Bounces: reflected light by precomputed transfer tensors, with materials that can change (Sun et al. 2007)."""
 
-from jaxprt.systems.bounces import build, functions, gather, jobs, parts, patches, tensor, traced
+from jaxprt.systems.bounces import build, exported, functions, gather, jobs, parts, patches, tensor, traced
 from jaxprt.systems.bounces.build import precompute
 from jaxprt.systems.bounces.parts import GroupBounces, ReflectingPart
 from jaxprt.systems.bounces.patches import Patches
@@ -13,6 +13,7 @@ __all__ = [
     "SecondBounce",
     "TransferTensor",
     "build",
+    "exported",
     "functions",
     "gather",
     "jobs",

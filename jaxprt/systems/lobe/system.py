@@ -128,6 +128,10 @@ class LobeSystem(protocol.VertexSystem):
             light = self.shade(light)
         return combine(light, view)
 
+    def diffuse_albedo(self, view: LobeView) -> Float[Array, "v c"]:
+        """Albedo of the diffuse part: `System.diffuse_albedo`."""
+        return view.diffuse.T
+
     def exported(self, what: str) -> ExportedLobes:
         """The table of lobes, averaged visibility, and transfer vectors for the diffuse part: `System.exported`."""
         vector = diffuse.harmonics_of(self.transport.vector, size=self.transport.size, degree=DEGREE)
