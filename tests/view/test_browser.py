@@ -293,22 +293,22 @@ def test_two_viewers_at_once_and_a_tab_opened_again(browser, server, hand):
     again.page.close()
 
 
-def test_a_server_that_was_killed_is_told_and_the_viewer_goes_on_when_it_is_back(browser, session):
-    server = Server(session)
-    made = Hand(browser, server.url)
+def test_a_server_that_was_killed_is_told_and_the_viewer_goes_on_when_it_is_back(browser, systems, lights):
+    server = Server(Session(systems, environments=lights))
+    hand = Hand(browser, server.url)
     port, token = server._server.server_port, server._server.token
     server.close()
-    made.page.keyboard.press("h")
-    made.page.mouse.move(60, 60)
-    made.page.mouse.down()
-    made.page.mouse.move(90, 60)
-    made.page.mouse.up()
-    made.page.wait_for_function(f"() => {TOLD}.includes('no answer from Python')")
-    back = Server(session, port=port)
+    hand.page.mouse.move(60, 60)
+    hand.page.mouse.down()
+    hand.page.mouse.move(90, 60)
+    hand.page.mouse.up()  # colors may come from the GPU; the picture at rest that follows is Python's
+    hand.page.wait_for_function(f"() => {TOLD}.includes('no answer from Python')")
+    back = Server(Session(systems, environments=lights), port=port)
     back._server.token = token
-    made.settle()
-    assert not made.errors
-    made.page.close()
+    hand.wait("stills > 0")
+    hand.page.wait_for_function(f"() => {TOLD} === ''")
+    assert not hand.errors
+    hand.page.close()
     back.close()
 
 

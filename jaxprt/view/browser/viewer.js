@@ -30,6 +30,7 @@ export function mount(root, ask) {
   let long = false, bytes = null, partial = false;
   let exposed = null; // the light that the exposure has been found for, while it is automatic
   let seq = 0, flying = false, dirty = false, wanted = 0, stillTimer = 0, stillBusy = false, skyKey = {}, framed = 0;
+  let unanswered = false; // whether the last picture at rest got no answer; it is asked for again
   let rest = { size: "", made: 0, ms: 0 }; // whole pictures at rest of one size: how many, and what the last one took
   const viewer = `${Date.now()}-${Math.random()}`; // its name, since each viewer of a session counts its own looks
 
@@ -197,7 +198,9 @@ export function mount(root, ask) {
       for (const [kind, coarse] of steps) {
         const asked = { ...message(kind), ...size, coarse, transparent: kind === "still" && !state.background }, words = "computing the picture at pixels";
         const { content, buffers } = await waiting.during("still", kind === "still" ? words : "computing the exact picture", ask(asked));
-        if (closed || own !== seq || content.kind === "late") break;
+        if (closed) break;
+        if (unanswered) { unanswered = false; tell(""); }
+        if (own !== seq || content.kind === "late") break;
         if (content.kind === "error") { tell(content.message); break; }
         const compressed = asked.stops !== null, count = content.width * content.height;
         const data = compressed ? await inflate(buffers[0], count) : new Uint16Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 2);
@@ -212,11 +215,12 @@ export function mount(root, ask) {
         redraw();
       }
     } catch (error) {
+      unanswered = true;
       tell(`no answer from Python: ${error.message}`);
     } finally {
       stillBusy = false;
     }
-    if (own !== seq && !flying && stats.shown === seq) stillTimer = setTimeout(still, 250);
+    if ((own !== seq || unanswered) && !closed && !flying && stats.shown === seq) stillTimer = setTimeout(still, unanswered ? 1000 : 250);
   };
 
   const set = (fields) => { Object.assign(state, fields); controls?.show(); moved(); };
