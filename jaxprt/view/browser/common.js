@@ -11,10 +11,10 @@ export const hex = (color) => "#" + color.map((x) => Math.round(255 * toDisplay(
 export const unhex = (text) => [1, 3, 5].map((i) => toLinear(parseInt(text.slice(i, i + 2), 16) / 255));
 
 export function element(tag, parent, fields = {}) {
-  const made = document.createElement(tag);
-  Object.assign(made, fields);
-  parent.appendChild(made);
-  return made;
+  const node = document.createElement(tag);
+  Object.assign(node, fields);
+  parent.appendChild(node);
+  return node;
 }
 
 // Colors that Python has exposed, made bytes, and compressed: differences, channel by channel. Where a mask comes with
@@ -31,7 +31,7 @@ export async function decompressed(data) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-// A message and its arrays from one string of bytes, as Python's `messages.pack` has made it.
+// A message and its arrays from one string of bytes, as `messages.pack` of Python packs them.
 export function unpack(data) {
   const size = new DataView(data).getUint32(0, true), head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, size)));
   let place = 4 + size;

@@ -62,16 +62,16 @@ export class Drawing {
   build() {
     const gl = this.gl;
     const program = (vertex, fragment) => {
-      const made = gl.createProgram();
+      const handle = gl.createProgram();
       for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
         const shader = gl.createShader(kind);
         gl.shaderSource(shader, text);
         gl.compileShader(shader);
         if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) throw new Error(gl.getShaderInfoLog(shader));
-        gl.attachShader(made, shader);
+        gl.attachShader(handle, shader);
       }
-      gl.linkProgram(made);
-      return { made, at: (name) => gl.getUniformLocation(made, name) };
+      gl.linkProgram(handle);
+      return { handle, at: (name) => gl.getUniformLocation(handle, name) };
     };
     this.mesh = program(VERTEX, MESH);
     this.colored = program(COLORED, MESH);
@@ -111,16 +111,16 @@ export class Drawing {
     this.drawn = true;
   }
   texture(data, width, height, encoded, repeat, alpha = false) {
-    const gl = this.gl, made = gl.createTexture();
+    const gl = this.gl, handle = gl.createTexture();
     gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, made);
+    gl.bindTexture(gl.TEXTURE_2D, handle);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     const [form, bytes, halves] = alpha ? [gl.RGBA, gl.RGBA8, gl.RGBA16F] : [gl.RGB, gl.RGB8, gl.RGB16F];
     gl.texImage2D(gl.TEXTURE_2D, 0, encoded ? bytes : halves, width, height, 0, form, encoded ? gl.UNSIGNED_BYTE : gl.HALF_FLOAT, data);
     for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.LINEAR);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, repeat ? gl.REPEAT : gl.CLAMP_TO_EDGE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
-    return made;
+    return handle;
   }
   setSky(data, { width, height, scale, levels = 1 }) { // levels: pictures of half the size follow, as mip maps
     const gl = this.gl;
@@ -149,7 +149,7 @@ export class Drawing {
   dropStills(kept) { while (this.stills.length > kept) this.gl.deleteTexture(this.stills.shift().image); }
   quad(program, image, gain, encoded, tone) {
     const gl = this.gl;
-    gl.useProgram(program.made);
+    gl.useProgram(program.handle);
     gl.bindVertexArray(this.empty);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, image);
@@ -174,12 +174,12 @@ export class Drawing {
     gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     if (image) {
       gl.enable(gl.BLEND);
-      this.quad(this.shaded, image.made, gain, false, tone);
+      this.quad(this.shaded, image.handle, gain, false, tone);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
       gl.disable(gl.BLEND);
     } else if (this.count && (gpu ? gpu.message : this.drawn)) {
       const program = gpu ? this.colored : this.mesh;
-      gl.useProgram(program.made);
+      gl.useProgram(program.handle);
       gl.bindVertexArray(this.array);
       gl.uniformMatrix4fv(program.at("matrix"), false, camera.matrix(width / height, center));
       gl.uniform1f(program.at("gain"), gpu ? gain : gain * this.scale);
@@ -229,11 +229,11 @@ export class Drawing {
     const gl = this.gl, most = gl.getParameter(gl.MAX_RENDERBUFFER_SIZE), samples = Math.min(4, gl.getParameter(gl.MAX_SAMPLES));
     if (Math.max(width, height) > most) throw new Error(`a picture must have at most ${most} pixels along an edge in this browser, got ${width} x ${height}`);
     const buffer = (count, kind, place) => {
-      const made = gl.createRenderbuffer();
-      gl.bindRenderbuffer(gl.RENDERBUFFER, made);
+      const handle = gl.createRenderbuffer();
+      gl.bindRenderbuffer(gl.RENDERBUFFER, handle);
       gl.renderbufferStorageMultisample(gl.RENDERBUFFER, count, kind, width, height);
-      gl.framebufferRenderbuffer(gl.FRAMEBUFFER, place, gl.RENDERBUFFER, made);
-      return made;
+      gl.framebufferRenderbuffer(gl.FRAMEBUFFER, place, gl.RENDERBUFFER, handle);
+      return handle;
     };
     const [many, one] = [gl.createFramebuffer(), gl.createFramebuffer()], result = new Uint8Array(4 * width * height);
     if (this.gpu && !image) this.gpu.piece.vertices(this.gpu.message);

@@ -37,10 +37,10 @@ export function frameOf(shadow, on) {
   const help = helpOf(stage);
   const dialog = dialogOf(frame, canvas, on.picture);
   const tool = (name, label, act) => {
-    const made = element("button", tools, { type: "button", title: label, onclick: act });
-    made.innerHTML = `<svg viewBox="0 0 16 16" aria-hidden="true"><path d="${ICONS[name]}"/></svg>`;
-    made.setAttribute("aria-label", label);
-    return made;
+    const node = element("button", tools, { type: "button", title: label, onclick: act });
+    node.innerHTML = `<svg viewBox="0 0 16 16" aria-hidden="true"><path d="${ICONS[name]}"/></svg>`;
+    node.setAttribute("aria-label", label);
+    return node;
   };
   const started = () => { hint.hidden = true; };
   const toggleHelp = () => { help.hidden = !help.hidden; started(); if (help.hidden) canvas.focus(); else help.querySelector("button").focus(); };

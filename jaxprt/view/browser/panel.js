@@ -8,54 +8,54 @@ const FILTER = 10; // parts up to which one is open at first; of more, names can
 const DEGREE = Math.PI / 180;
 
 const section = (panel, title, open = true, className = "") => {
-  const made = element("details", panel, { open, className });
-  element("summary", made, { textContent: title, title });
-  return made;
+  const node = element("details", panel, { open, className });
+  element("summary", node, { textContent: title, title });
+  return node;
 };
 const row = (parent, text) => {
-  const made = element("label", parent, { className: "row" });
-  element("span", made, { textContent: text });
-  return made;
+  const node = element("label", parent, { className: "row" });
+  element("span", node, { textContent: text });
+  return node;
 };
 
 // A slider and a number that can be typed. The slider runs over places, which `at` makes values of and `of` finds again.
 function slider(parent, text, { low, high, step, at = (x) => x, of = (x) => x, digits, title = text, wrap = (x) => clamp(x, low, high) }, pick) {
-  const made = element("div", parent, { className: "row", title });
-  element("span", made, { textContent: text });
-  const [from, to] = [of(low), of(high)].sort((a, b) => a - b), range = element("input", made, { type: "range", min: from, max: to, step: step ?? (to - from) / 200 });
-  const number = element("input", made, { type: "number", step: 10 ** -digits });
+  const node = element("div", parent, { className: "row", title });
+  element("span", node, { textContent: text });
+  const [from, to] = [of(low), of(high)].sort((a, b) => a - b), range = element("input", node, { type: "range", min: from, max: to, step: step ?? (to - from) / 200 });
+  const number = element("input", node, { type: "number", step: 10 ** -digits });
   range.setAttribute("aria-label", text);
   number.setAttribute("aria-label", `${text}, typed`);
   range.oninput = () => pick(at(Number(range.value)));
-  number.onchange = () => { if (number.value !== "" && Number.isFinite(Number(number.value))) pick(wrap(Number(number.value))); made.show(made.value, !number.disabled); };
+  number.onchange = () => { if (number.value !== "" && Number.isFinite(Number(number.value))) pick(wrap(Number(number.value))); node.show(node.value, !number.disabled); };
   number.onkeydown = (event) => { if (event.key === "Enter") number.onchange(); };
-  made.show = (value, acts = true) => {
-    made.value = value;
+  node.show = (value, acts = true) => {
+    node.value = value;
     range.disabled = number.disabled = !acts;
     const shown = String(Number(value.toFixed(digits)));
     if (range.value !== String(of(value))) range.value = of(value);
     if (number.value !== shown) number.value = shown;
     range.setAttribute("aria-valuetext", shown);
   };
-  return made;
+  return node;
 }
 
 export function panelOf(panel, scene, state, { set, expose, automatic, map, moved, open }) {
   panel.textContent = "";
   const choice = (parent, text, names, pick) => {
-    const made = element("select", row(parent, text));
-    made.fill = (every) => { made.textContent = ""; every.forEach((name, i) => element("option", made, { textContent: name, value: i })); };
-    made.fill(names);
-    made.onchange = () => pick(Number(made.value));
-    return made;
+    const node = element("select", row(parent, text));
+    node.fill = (labels) => { node.textContent = ""; labels.forEach((name, i) => element("option", node, { textContent: name, value: i })); };
+    node.fill(names);
+    node.onchange = () => pick(Number(node.value));
+    return node;
   };
   const box = (parent, text, key) => {
     const label = element("label", panel, { className: "row" });
     parent.appendChild(label);
     element("span", label, { className: "long", textContent: text });
-    const made = element("input", label, { type: "checkbox" });
-    made.onchange = () => set({ [key]: made.checked });
-    return [key, made];
+    const node = element("input", label, { type: "checkbox" });
+    node.onchange = () => set({ [key]: node.checked });
+    return [key, node];
   };
 
   const lightPart = section(panel, "Light");
@@ -203,19 +203,19 @@ function stripOf(canvas, tint, state, set) {
 // The controls of one part: by their names in its model, and a plane where roughness and reflectance both act.
 function materialOf(parent, part, state, opened, moved) {
   const { free } = part, value = (name) => state.materials[part.name]?.[name] ?? free[name];
-  const made = section(parent, part.name, opened, "part");
+  const node = section(parent, part.name, opened, "part");
   const change = (fields) => { state.materials = { ...state.materials, [part.name]: { ...state.materials[part.name], ...fields } }; show(); moved(); };
   const blinn = free.exponent !== undefined, metallic = free.metallic !== undefined, shows = [];
   const reflects = () => !metallic || value("metallic") < 1; // of a metal the base color is the reflectance
   const color = (text, name, acts = () => true) => {
     if (!free[name]) return;
-    const input = element("input", row(made, text), { type: "color" });
+    const input = element("input", row(node, text), { type: "color" });
     input.oninput = () => change({ [name]: unhex(input.value) });
     shows.push(() => { input.value = hex(value(name)); input.disabled = !acts(); });
   };
   const number = (text, name, options) => {
     if (free[name] === undefined) return;
-    const control = slider(made, text, { digits: 3, ...options }, (x) => change({ [name]: x }));
+    const control = slider(node, text, { digits: 3, ...options }, (x) => change({ [name]: x }));
     shows.push(() => control.show(value(name), options.acts?.() ?? true));
   };
   const [low, high] = free.exponent_range ?? free.roughness_range ?? [0, 1], span = high / low;
@@ -228,13 +228,13 @@ function materialOf(parent, part, state, opened, moved) {
   color("specular tint", "specular", reflects);
   const across = blinn ? "exponent" : free.roughness_range ? "roughness" : null;
   // Of Blinn-Phong the exponent falls to the right, as roughness grows.
-  if (across && free.f0 !== undefined) shows.push(planeOf(made, { across, low, high, value, change, hidden: () => !reflects() }));
-  const reset = element("button", element("div", made, { className: "row" }), { type: "button", textContent: "as it was" });
+  if (across && free.f0 !== undefined) shows.push(planeOf(node, { across, low, high, value, change, hidden: () => !reflects() }));
+  const reset = element("button", element("div", node, { className: "row" }), { type: "button", textContent: "as it was" });
   reset.onclick = () => { const { [part.name]: _, ...others } = state.materials; state.materials = others; show(); moved(); };
   shows.push(() => { reset.disabled = !state.materials[part.name]; });
-  const show = () => { if (made.open) for (const each of shows) each(); };
-  made.ontoggle = show;
-  return { box: made, show };
+  const show = () => { if (node.open) for (const each of shows) each(); };
+  node.ontoggle = show;
+  return { box: node, show };
 }
 
 // The plane of roughness and reflectance at normal incidence, whose square root goes up. It is drawn in the theme's colors.

@@ -86,9 +86,9 @@ export class Piece {
   }
   // The image of a texture, with mip maps.
   sampler({ image, wrap }, name) {
-    const { gl } = this, { width, height, channels } = this.content.images[image], data = this.images[image], made = gl.createTexture();
+    const { gl } = this, { width, height, channels } = this.content.images[image], data = this.images[image], handle = gl.createTexture();
     gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, made);
+    gl.bindTexture(gl.TEXTURE_2D, handle);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     if (channels === 3) {
       const colors = new Uint8Array(4 * width * height);
@@ -100,12 +100,12 @@ export class Piece {
     const many = gl.getExtension("EXT_texture_filter_anisotropic");
     if (many) gl.texParameterf(gl.TEXTURE_2D, many.TEXTURE_MAX_ANISOTROPY_EXT, Math.min(8, gl.getParameter(many.MAX_TEXTURE_MAX_ANISOTROPY_EXT)));
     [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T].forEach((side, i) => gl.texParameteri(gl.TEXTURE_2D, side, { repeat: gl.REPEAT, mirror: gl.MIRRORED_REPEAT, clamp: gl.CLAMP_TO_EDGE }[wrap[i]]));
-    return made;
+    return handle;
   }
   close() {
     const { gl } = this;
-    for (const part of this.content.parts) for (const made of part.samplers) if (made) gl.deleteTexture(made);
-    for (const { made, frame } of Object.values(this.textures)) { gl.deleteTexture(made); if (frame) gl.deleteFramebuffer(frame); }
+    for (const part of this.content.parts) for (const handle of part.samplers) if (handle) gl.deleteTexture(handle);
+    for (const { handle, frame } of Object.values(this.textures)) { gl.deleteTexture(handle); if (frame) gl.deleteFramebuffer(frame); }
     for (const program of Object.values(this.programs)) gl.deleteProgram(program);
     gl.deleteVertexArray(this.empty);
   }
@@ -129,8 +129,8 @@ export class Piece {
     const held = (this.textures[name] ??= { unit: this.unit++ });
     gl.activeTexture(gl.TEXTURE0 + held.unit);
     if (held.rows === rows) return held;
-    gl.deleteTexture(held.made ?? null);
-    gl.bindTexture(gl.TEXTURE_2D, (held.made = gl.createTexture()));
+    gl.deleteTexture(held.handle ?? null);
+    gl.bindTexture(gl.TEXTURE_2D, (held.handle = gl.createTexture()));
     gl.texStorage2D(gl.TEXTURE_2D, 1, internal, WIDTH, rows);
     for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
     held.rows = rows;
@@ -140,7 +140,7 @@ export class Piece {
   target(name, entries) {
     const gl = this.gl, held = this.allocate(name, gl.RGBA32UI, entries);
     gl.bindFramebuffer(gl.FRAMEBUFFER, (held.frame = gl.createFramebuffer()));
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, held.made, 0);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, held.handle, 0);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     return held;
   }
@@ -306,7 +306,7 @@ export class Piece {
   // Has a program read the textures of a part, which its factors multiply.
   sample(program, part, factors) {
     const { gl } = this, at = (name) => this.at(name, program);
-    const found = part.samplers.map((made, i) => (made ? 1 << i : 0));
+    const found = part.samplers.map((handle, i) => (handle ? 1 << i : 0));
     gl.uniform1i(at("sampled"), found[0] + found[1] + found[2]);
     if (!found.some(Boolean)) return;
     gl.uniform3fv(at("baseColor"), factors.base);
@@ -331,7 +331,7 @@ export class Piece {
     this.shade(this.programs.vertex, message, (part) => this.over(part.first, part.count));
     this.finish();
   }
-  // The colors that `vertices` has made, in half floats.
+  // The colors that `vertices` has computed, in half floats.
   read() {
     const { gl, count } = this, found = new Uint32Array(4 * WIDTH * this.color.rows), result = new Uint16Array(3 * count);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.color.frame);
@@ -498,10 +498,10 @@ class Answers {
 
 // What `mount` of `viewer.js` asks: the answers of a scene that `export` has written.
 export function answers(content, buffers) {
-  const made = new Answers(content, buffers);
+  const piece = new Answers(content, buffers);
   return async (message, given = []) => {
     try {
-      return made.answer(message, given);
+      return piece.answer(message, given);
     } catch (error) {
       return { content: { kind: "error", of: message.kind, message: `${message.name ?? "the viewer"} ${error.message}` }, buffers: [] };
     }

@@ -70,7 +70,7 @@ export class Pixels {
   }
   close() {
     const { gl, piece } = this;
-    for (const { made, frame } of Object.values(this.images)) { gl.deleteTexture(made); gl.deleteFramebuffer(frame); }
+    for (const { handle, frame } of Object.values(this.images)) { gl.deleteTexture(handle); gl.deleteFramebuffer(frame); }
     this.release();
     gl.deleteProgram(this.raster);
     gl.deleteProgram(this.rest);
@@ -80,7 +80,7 @@ export class Pixels {
   release() {
     const { gl, triangles } = this;
     if (!triangles) return;
-    gl.deleteTexture(triangles.made);
+    gl.deleteTexture(triangles.handle);
     gl.deleteRenderbuffer(triangles.depth);
     gl.deleteFramebuffer(triangles.frame);
     this.triangles = null;
@@ -200,41 +200,41 @@ export class Pixels {
     }
   }
   dispose() {
-    const { made, frame } = this.images.saved;
-    this.gl.deleteTexture(made);
+    const { handle, frame } = this.images.saved;
+    this.gl.deleteTexture(handle);
     this.gl.deleteFramebuffer(frame);
     delete this.images.saved;
   }
   image(name, width, height) {
     const gl = this.gl, held = this.images[name];
     if (held?.width === width && held.height === height) return held;
-    if (held) { gl.deleteTexture(held.made); gl.deleteFramebuffer(held.frame); }
-    const made = gl.createTexture(), frame = gl.createFramebuffer();
+    if (held) { gl.deleteTexture(held.handle); gl.deleteFramebuffer(held.frame); }
+    const handle = gl.createTexture(), frame = gl.createFramebuffer();
     gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, made);
+    gl.bindTexture(gl.TEXTURE_2D, handle);
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, width, height);
     for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.LINEAR);
     for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, made, 0);
-    return (this.images[name] = { made, frame, width, height });
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, handle, 0);
+    return (this.images[name] = { handle, frame, width, height });
   }
   // The vertices of the triangle that each pixel shows, and where the pixel lies between them.
   find(matrix, columns, rows, width, height) {
     const { gl, piece } = this;
     if (this.triangles?.width !== width || this.triangles.height !== height) {
       this.release();
-      const made = gl.createTexture(), frame = gl.createFramebuffer(), depth = gl.createRenderbuffer();
+      const handle = gl.createTexture(), frame = gl.createFramebuffer(), depth = gl.createRenderbuffer();
       gl.activeTexture(gl.TEXTURE0 + this.unit);
-      gl.bindTexture(gl.TEXTURE_2D, made);
+      gl.bindTexture(gl.TEXTURE_2D, handle);
       gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, width, height);
       for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
       gl.bindRenderbuffer(gl.RENDERBUFFER, depth);
       gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, height);
       gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
-      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, made, 0);
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, handle, 0);
       gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, depth);
-      this.triangles = { made, frame, depth, width, height };
+      this.triangles = { handle, frame, depth, width, height };
     }
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.triangles.frame);
     gl.viewport(0, 0, columns, rows);
