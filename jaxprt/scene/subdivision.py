@@ -1,7 +1,8 @@
 """Subdivision of triangles at the midpoints of their edges, to add vertices where they are needed.
 
 Edges are identified by the positions of their endpoints. Both sides of a seam are therefore divided in the same way,
-and so are parts of a scene that share a border. Subdivision opens no gaps in the surface.
+and so are parts of a scene that share a border, even if rounding moved the two sides apart. Subdivision opens no gaps
+in the surface.
 """
 
 import dataclasses
@@ -12,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int, Integer
 
@@ -24,6 +26,12 @@ from jaxprt.scene.scene import Part, Scene
 # Steps of the additive recurrence R2, which fills a square evenly.
 _R2 = np.array([0.7548776662466927, 0.5698402909980532])
 _FACE = 300  # bytes of a triangle and its share of vertices, in the scene and while it is divided
+# Corners that a file has at one place differ by rounding in float32. Transforming them sums four products, each rounded
+# twice, on either side of the joint: at most 8 steps of 2^-23 times the largest coordinate.
+_ROUNDING = 2.0**-20
+_SLIVER = (
+    2.0**-10
+)  # no two corners of a triangle are one place, unless its shortest edge is below this share of its longest
 _CANCELED = 1e-6  # two unit normals cancel if their mean is shorter than this
 
 # Triangles that replace a triangle, by which of its edges are cut, counted from the longest edge. Corners are 0 to 2,
@@ -69,21 +77,30 @@ class Edges:
     Args:
         position: Positions of the vertices.
         face: Vertex indices of each triangle.
+        joint: Pairs of vertices at one place whose positions differ by rounding: those of `joints` for a mesh that was
+            not divided, and those of `joints_after` for one that was. If None, the result of `joints`.
 
     Attributes:
         face: Vertex indices of each triangle.
+        joint: The pairs of vertices at one place whose positions differ.
         number: Index of the edge from each corner of a triangle to the next. All triangles at an edge share its index.
         length: Length of each edge.
         added: Number of vertices that the midpoint of each edge needs: two at a seam.
         longest: Index of each triangle's longest edge; among equally long ones, the highest index.
     """
 
-    def __init__(self, position: Float[ArrayLike, "v 3"], face: Integer[ArrayLike, "f 3"]):
+    def __init__(
+        self,
+        position: Float[ArrayLike, "v 3"],
+        face: Integer[ArrayLike, "f 3"],
+        joint: Int[np.ndarray, "n 2"] | None = None,
+    ):
         self.face = np.asarray(face, np.int64)
-        position = np.asarray(position)
+        self._position = position = np.asarray(position)
+        self.joint = joints(position, self.face) if joint is None else joint
         self._vertices = len(position)
         self._ends = np.stack([self.face, np.roll(self.face, -1, 1)], -1)
-        low, high = np.moveaxis(np.sort(places(position)[self._ends], -1), -1, 0)
+        low, high = np.moveaxis(np.sort(_joined(places(position), self.joint)[self._ends], -1), -1, 0)
         _, first, number = np.unique(low * self._vertices + high, return_index=True, return_inverse=True)
         self.number = number.reshape(-1, 3)
         start, stop = position.astype(np.float64)[self._ends.reshape(-1, 2)[first].T]
@@ -136,6 +153,22 @@ class Edges:
         order = np.argsort(np.concatenate(origin), kind="stable")
         ends = np.stack(np.divmod(parent, self._vertices), -1)
         return Division(np.concatenate(face)[order], np.concatenate(origin)[order], ends)
+
+    def joints_after(self, division: Division) -> Int[np.ndarray, "n 2"]:
+        """Pairs of vertices at one place whose positions differ, after a step of `divide`.
+
+        Vertices added to one edge are at one place, however its endpoints were rounded.
+        """
+        if not self.joint.size:
+            return self.joint
+        parent, first = np.unique(self._pairs(), return_index=True)
+        key = division.parent[:, 0] * self._vertices + division.parent[:, 1]
+        edge = self.number.ravel()[first[np.searchsorted(parent, key)]]
+        order = np.argsort(edge, kind="stable")
+        pair = np.stack([order[:-1], order[1:]], -1)[edge[order[:-1]] == edge[order[1:]]]
+        added = middle(self._position, division.parent)
+        pair = pair[(added[pair[:, 0]] != added[pair[:, 1]]).any(1)]
+        return np.concatenate([self.joint, self._vertices + pair])
 
     def _pairs(self) -> np.ndarray:
         """One integer key for the two endpoints of each triangle's edges."""
@@ -270,17 +303,18 @@ def divide(scene: Scene, *, edge: float) -> Scene:
     require.number("edge", edge, 0.0, above=True)
     mesh = scene.mesh
     position, face = np.asarray(mesh.position), np.asarray(mesh.face)
-    divisions = []
+    divisions, joint = [], None
     corner = position[face].astype(np.float64)
     longest = np.linalg.norm(np.roll(corner, -1, 1) - corner, axis=2).max(1)
     faces = float(np.sum(np.maximum(longest / float(edge), 1) ** 2)) / 2  # of slim triangles fewer are made
     require.memory(f"some {faces:.2g} triangles", int(min(faces, 1e30)) * _FACE, "give a longer edge")
     while True:
-        edges = Edges(position, face)
+        edges = Edges(position, face, joint)
         marked = edges.length > edge
         if not marked.any():
             return subdivide_scene(scene, divisions)
         divisions.append(edges.divide(edges.closed(marked)))
+        joint = edges.joints_after(divisions[-1])
         face = divisions[-1].face
         position = np.concatenate([position, middle(position, divisions[-1].parent)])
 
@@ -341,3 +375,45 @@ def places(position: np.ndarray) -> np.ndarray:
     place = np.empty(len(position), np.int64)
     place[order] = np.concatenate([[0], np.cumsum(another)])
     return place
+
+
+def joints(position: Float[np.ndarray, "v 3"], face: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "n 2"]:
+    """Pairs of vertices at one place whose positions differ by rounding, the lower index first.
+
+    Such vertices are not farther apart than rounding in float32 moves them, nor than 2^-10 of the longest edge of any
+    triangle at them. The result is empty for a mesh whose parts touch at equal positions.
+
+    Args:
+        position: Positions of the vertices, finite.
+        face: Vertex indices of each triangle.
+    """
+    position, face = np.asarray(position, np.float64), np.asarray(face, np.int64)
+    corner = position[face]
+    longest = np.linalg.norm(np.roll(corner, -1, 1) - corner, axis=2).max(1)
+    extended = longest > 0
+    if not extended.any():
+        return np.zeros((0, 2), np.int64)
+    place = places(position)
+    reach = np.full(place.max() + 1, np.inf)
+    np.minimum.at(reach, place[face[extended]].ravel(), np.repeat(_SLIVER * longest[extended], 3))
+    _, vertex = np.unique(place, return_index=True)
+    vertex, reach = vertex[np.isfinite(reach)], reach[np.isfinite(reach)]
+    reach = np.minimum(reach, _ROUNDING * np.abs(corner[extended]).max())
+    tree = scipy.spatial.cKDTree(position[vertex], balanced_tree=False, compact_nodes=False)
+    nearest = tree.query(position[vertex], k=[2], distance_upper_bound=np.nextafter(reach.max(), np.inf))[0][:, 0]
+    near = np.flatnonzero(nearest <= reach)
+    around = tree.query_ball_point(position[vertex[near]], reach[near])
+    first, second = np.repeat(near, [len(other) for other in around]), np.concatenate([[], *around]).astype(np.int64)
+    apart = np.linalg.norm(position[vertex[first]] - position[vertex[second]], axis=1)
+    both = (first != second) & (apart <= reach[second])
+    return np.unique(np.sort(np.stack([vertex[first], vertex[second]], -1)[both], 1), axis=0)
+
+
+def _joined(place: np.ndarray, joint: np.ndarray) -> np.ndarray:
+    """The integers `place`, made equal for pairs of vertices: the smallest of all that are joined."""
+    if not joint.size:
+        return place
+    count, (first, second) = int(place.max()) + 1, place[joint].T
+    graph = scipy.sparse.coo_array((np.ones(len(joint), np.int8), (first, second)), shape=(count, count))
+    group = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    return np.unique(group, return_index=True)[1][group][place]

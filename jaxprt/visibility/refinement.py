@@ -186,6 +186,7 @@ def divisions(
     # A single shadow on a share error^2 of the area is enough to cause the whole error.
     points = round(_HIDDEN * min(max(error, _FINEST) ** -2, vertices))
     result: list[Division] = []
+    joint = None
     with (
         threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(blocks.cores()) as pool,
@@ -202,11 +203,12 @@ def divisions(
             bar.update(count - bar.count, share=share, words=f"{100 * left:.2g} % error")
             if left <= error:
                 return result, left
-            edges = Edges(surface.position, surface.face)
+            edges = Edges(surface.position, surface.face, joint)
             marked = _edges_to_cut(surface, edges, squares, error, vertices - count)
             if not marked.any():
                 break
             result.append(edges.divide(marked))
+            joint = edges.joints_after(result[-1])
             surface.divide(result[-1])
     if error > 0:
         warnings.warn(

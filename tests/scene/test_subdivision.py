@@ -4,11 +4,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy
 import trimesh
 
 from jaxprt import brdf
 from jaxprt.brdf.varying import PerVertex
-from jaxprt.scene import Camera, Environment, Part, Scene, Texture, TexturedMaterial, builtin, subdivision
+from jaxprt.scene import Camera, Environment, Part, Scene, Texture, TexturedMaterial, builtin, load_scene, subdivision
 from jaxprt.scene.mesh import grid_face, make_mesh
 from jaxprt.scene.subdivision import Edges
 
@@ -20,17 +21,28 @@ def watertight(mesh) -> bool:
     return solid.is_watertight and solid.is_winding_consistent
 
 
-def hanging(mesh) -> int:
-    """How many vertices lie inside of an edge of a triangle: T-junctions."""
-    position = np.unique(np.asarray(mesh.position, np.float64), axis=0)
+def hanging(mesh, *, tolerance=2e-6) -> int:
+    """How many places of vertices lie inside of an edge of a triangle: T-junctions.
+
+    Args:
+        mesh: The mesh.
+        tolerance: Distance of corners at one place and of a vertex from an edge, relative to the extent.
+    """
     corner = np.asarray(mesh.position, np.float64)[np.asarray(mesh.face)]
+    tolerance *= np.ptp(corner.reshape(-1, 3), axis=0).max()
+    tree = scipy.spatial.cKDTree(corner.reshape(-1, 3))
     start, stop = corner.reshape(-1, 3), np.roll(corner, -1, 1).reshape(-1, 3)
-    along = stop - start
-    square = np.sum(along**2, 1)
-    away = position[:, None] - start
-    part = np.sum(away * along, -1) / np.where(square > 0, square, 1)
-    apart = np.linalg.norm(away - part[..., None] * along, axis=-1)
-    return int(np.sum((part > 1e-4) & (part < 1 - 1e-4) & (apart < 1e-6)))
+    length = np.linalg.norm(stop - start, axis=1)
+    near = tree.query_ball_point((start + stop) / 2, length / 2)
+    edge, vertex = np.repeat(np.arange(len(near)), [len(row) for row in near]), np.concatenate(near).astype(int)
+    along = (stop - start)[edge] / np.where(length > 0, length, 1)[edge, None]
+    away = tree.data[vertex] - start[edge]
+    part = np.sum(away * along, 1)
+    inside = (part > 2 * tolerance) & (part < length[edge] - 2 * tolerance)
+    inside &= np.linalg.norm(away - part[:, None] * along, axis=1) < tolerance
+    point = np.unique(vertex[inside])
+    pairs = scipy.spatial.cKDTree(tree.data[point]).query_pairs(2 * tolerance, output_type="ndarray")
+    return len(point) - len(np.unique(pairs[:, 1]))
 
 
 def areas(face, corner) -> np.ndarray:
@@ -49,13 +61,21 @@ def cube():
 def random_divisions(mesh, *, passes=4, share=0.1, seed=0) -> list:
     """Divisions at random edges."""
     rng = np.random.default_rng(seed)
-    position, face, result = np.asarray(mesh.position), np.asarray(mesh.face), []
+    position, face, joint, result = np.asarray(mesh.position), np.asarray(mesh.face), None, []
     for _ in range(passes):
-        edges = Edges(position, face)
+        edges = Edges(position, face, joint)
         result.append(edges.divide(edges.closed(rng.random(len(edges.length)) < share)))
-        face = result[-1].face
+        face, joint = result[-1].face, edges.joints_after(result[-1])
         position = np.concatenate([position, subdivision.middle(position, result[-1].parent)])
     return result
+
+
+def shaken(mesh, *, extent=1.0, steps=2, seed=0):
+    """The mesh at another extent, each triangle with corners of its own, moved by a few steps of float32."""
+    corner = np.asarray(mesh.position, np.float64)[np.asarray(mesh.face)].reshape(-1, 3)
+    corner = (corner * extent / np.ptp(corner, axis=0).max()).astype(np.float32)
+    step = np.random.default_rng(seed).integers(-steps, steps + 1, corner.shape) * np.spacing(np.abs(corner).max())
+    return make_mesh(corner + step, np.arange(len(corner)).reshape(-1, 3))
 
 
 def angles(mesh) -> np.ndarray:
@@ -135,6 +155,87 @@ def test_a_hanging_vertex_of_the_mesh_is_met_where_it_is_the_middle():
     assert len(divided.position) == 8
     assert hanging(divided) == 0
     assert np.sum(np.bincount(Edges(divided.position, divided.face).number.ravel()) == 2) == 4
+
+
+@pytest.mark.parametrize("extent", [1e-3, 1.0, 1e3])
+def test_sides_of_a_joint_that_rounding_moved_apart_are_divided_alike(extent):
+    mesh = shaken(builtin.sphere(rings=6, sectors=9), extent=extent)
+    assert len(subdivision.places(np.asarray(mesh.position))) == len(mesh.position)
+    divided = subdivision.subdivide(mesh, random_divisions(mesh))
+    assert len(divided.face) > 3 * len(mesh.face)
+    assert hanging(mesh) == hanging(divided) == 0
+
+
+@pytest.mark.parametrize("extent", [1e-3, 1.0, 1e3])
+def test_triangles_whose_shared_corner_differs_by_one_step_stay_joined(extent):
+    position = np.float32(extent) * np.array(
+        [[0, 0, 0], [1, 0, 0], [0, 0, 1], [0, 0, 1], [1, 0, 0], [1, 0, 1]], np.float32
+    )
+    position[4, 0] = np.nextafter(position[4, 0], np.float32(np.inf))
+    mesh = make_mesh(position, np.arange(6).reshape(2, 3))
+    np.testing.assert_array_equal(subdivision.joints(position, np.arange(6).reshape(2, 3)), [[1, 4]])
+    for seed in range(5):
+        divided = subdivision.subdivide(mesh, random_divisions(mesh, share=0.4, seed=seed))
+        assert len(divided.position) > 8
+        assert hanging(divided) == 0
+
+
+def test_triangles_without_area_and_doubled_ones_keep_joints_closed():
+    ball = shaken(builtin.sphere(rings=6, sectors=9))
+    position, face = np.asarray(ball.position), np.asarray(ball.face)
+    flat = np.column_stack([face[::3, 0], face[::3, 0], face[::3, 1]])
+    thin = np.column_stack([face[::4, 0], face[::4, 1], len(position) + np.arange(len(face[::4]))])
+    position = np.concatenate([position, np.nextafter(position[face[::4, 1]], np.float32(2))])
+    mesh = make_mesh(position, np.concatenate([face, face[::2], face[::5, ::-1], flat, thin]))
+    assert hanging(mesh) == 0
+    divided = subdivision.subdivide(mesh, random_divisions(mesh))
+    assert len(divided.face) > 2 * len(mesh.face)
+    assert hanging(divided) == 0
+
+
+def test_parts_that_rounding_moved_apart_share_their_border(scene):
+    left, right = scene.parts[1], scene.parts[0]
+    place = np.asarray(right.mesh.position)
+    moved = eqx.tree_at(lambda m: m.position, right.mesh, jnp.asarray(np.nextafter(place, np.float32(-1))))
+    apart = Scene([dataclasses.replace(right, mesh=moved), left])
+    assert subdivision.joints(np.asarray(apart.mesh.position), np.asarray(apart.mesh.face)).size
+    for divided in (
+        subdivision.divide(apart, edge=0.2),
+        subdivision.subdivide_scene(apart, random_divisions(apart.mesh, passes=3)),
+    ):
+        assert len(divided.mesh.face) > 60
+        assert hanging(divided.mesh) == 0
+
+
+def test_slices_of_a_cake_stay_joined(data):
+    # Slices are turned copies of one. One part is left out: in the file, corners of it lie inside of longer edges.
+    scene = load_scene(data / "foreign" / "cakeBirthday.glb")
+    scene = Scene([part for part in scene.parts if part.name != "brownDarkest"])
+    assert len(subdivision.joints(np.asarray(scene.mesh.position), np.asarray(scene.mesh.face))) > 50
+    assert hanging(scene.mesh) == 0
+    divided = subdivision.subdivide(scene.mesh, random_divisions(scene.mesh, passes=3))
+    assert len(divided.face) > 2 * len(scene.mesh.face)
+    assert hanging(divided) == 0
+
+
+def test_what_is_apart_by_more_than_rounding_is_not_joined(data):
+    sheet = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1]], np.float32)
+    face = np.arange(6).reshape(2, 3)
+
+    def joined(size, gap, *others):
+        position = np.concatenate([size * sheet, size * sheet + np.float32([0, gap, 0]), *others])
+        return subdivision.joints(position, np.concatenate([face, np.arange(6, len(position)).reshape(-1, 3)])).size > 0
+
+    assert joined(1, 5e-7)
+    assert not joined(1, 2e-6)
+    # A gap that small triangles show, beside large ones.
+    assert not joined(1e-4, 5e-7, sheet + 2)
+    assert not joined(1, 1e-2, 1e6 * sheet + 2)
+    assert not subdivision.joints(sheet, np.zeros((0, 3), int)).size
+    assert not subdivision.joints(sheet, np.array([[0, 0, 0]])).size
+    for name in ("meshes/spot.obj", "meshes/teapot.obj", "scenes/Duck.glb"):
+        mesh = load_scene(data / name).mesh
+        assert not subdivision.joints(np.asarray(mesh.position), np.asarray(mesh.face)).size
 
 
 @pytest.mark.parametrize("face", [[[0, 0, 1]], [[0, 1, 2], [0, 1, 3]], [[0, 0, 0]]], ids=["edge", "straight", "point"])
