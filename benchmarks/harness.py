@@ -94,8 +94,27 @@ def compare(function: Callable[[], Any], peer: Callable[[], Any], *, repeats: in
     Raises:
         ValueError: There are no repeats.
     """
-    mine, theirs = _alternate([function, peer], repeats)
+    mine, theirs = alternate([function, peer], repeats=repeats)
     return mine, theirs
+
+
+def alternate(functions: Sequence[Callable[[], Any]], *, repeats: int) -> list[Timing]:
+    """Times several functions in turn, as `compare` does two.
+
+    Functions that are timed one after another differ by what the process and the machine do meanwhile: frames of
+    drawing that were timed first took up to half as long again as the same frames later.
+
+    Args:
+        functions: What to time.
+        repeats: Calls of each after the first.
+
+    Returns:
+        Timings as from ``measure``, in the same order.
+
+    Raises:
+        ValueError: There are no repeats.
+    """
+    return _alternate(list(functions), repeats)
 
 
 def report(line: Mapping[str, Any], output: pathlib.Path | None = None) -> dict[str, Any]:
