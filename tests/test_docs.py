@@ -25,7 +25,7 @@ import trimesh
 import jaxprt as prt
 from jaxprt.files import extensions
 from jaxprt.relit import Clusters, Harmonics, recipes, registry
-from jaxprt.scene.formats import nerf
+from jaxprt.scene.formats import gltf_file, nerf
 
 pytestmark = pytest.mark.documents
 
@@ -288,6 +288,15 @@ def test_anchors_are_those_of_github():
     text = "# A title: `code`, 2 words\n\n(label)=\n\n## Same\n\n## Same\n\n"
     text += "```python\n# none\n```\n\n## [Link](x.md) & more\n"
     assert anchors(text) == {"a-title-code-2-words", "label", "same", "same-1", "link--more"}
+
+
+def test_the_table_of_gltf_has_every_extension_that_is_read_and_says_so():
+    rows = [line for line in (DOCS / "guides/gltf.md").read_text().splitlines() if line.startswith("| `")]
+    stated = {}
+    for row in rows:
+        name, word = row.split("|")[1:3]
+        stated |= dict.fromkeys(re.findall(r"`((?:KHR|EXT|MSFT)_\w+)`", name), word.strip())
+    assert {name for name, word in stated.items() if word != "no"} == gltf_file.HONORED
 
 
 def test_readme_is_short():

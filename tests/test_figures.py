@@ -10,7 +10,7 @@ from PIL import Image
 
 from benchmarks import relight_harmonic
 from benchmarks.figures import __main__ as program
-from benchmarks.figures import drawing, pages, sun2007
+from benchmarks.figures import drawing, pages, quoted, sun2007
 from jaxprt.scene import builtin
 
 pytestmark = pytest.mark.documents
@@ -29,6 +29,32 @@ def test_pictures_are_small_enough_and_named_by_a_page():
     for picture in (DOCS / "pictures").iterdir():
         assert picture.stat().st_size < 300_000
         assert f"pictures/{picture.name}" in text
+
+
+def test_every_figure_that_a_page_quotes_has_a_line_and_is_that_of_its_section():
+    assert not quoted.faults()
+
+
+def test_figures_without_a_line_other_figures_and_lines_of_gone_figures_are_told(tmp_path):
+    for folder in quoted.MEASURED:
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "docs/measured/times.md").write_text("# Times\n\n| light | 0.0622 |\n\n## Sums\n\n1,204 ms, .5 s\n")
+    (tmp_path / "README.md").write_text(
+        "It is 6.2 % off, takes 1,204 ms and\nthen .45 to\n.5 s, `9 s`, 4 MB.\n\n```text\n7 s\n```\n"
+    )
+    assert [tuple(figure)[1:] for figure in quoted.all_quotes(tmp_path)] == [
+        *(("6.2 %", 1), ("1,204 ms", 1), (".45 to .5 s", 1), ("4 MB", 1))
+    ]
+    sources = {"6.2 %": "#times", "1,204 ms": "#times", ".45 to .5 s": "#sums", "3 s": "#sums"}
+    rows = [{"figure": figure, "from": f"docs/measured/times.md{anchor}"} for figure, anchor in sources.items()]
+    text = "".join(json.dumps({"page": "README.md", "place": 1, **row}) + "\n" for row in rows)
+    (tmp_path / quoted.REGISTER).write_text(text)
+    faults = quoted.faults(tmp_path)
+    assert [fault.partition(" (")[0] for fault in faults] == [
+        *("README.md: '1,204 ms'", "README.md: '.45 to .5 s'", "README.md: '4 MB'", "README.md no longer has '3 s'")
+    ]
+    assert "differs from" in faults[0]
+    assert "has no line" in faults[2]
 
 
 def test_every_figure_has_a_table():
