@@ -86,7 +86,7 @@ def load_scene(
     Geometry is read like `load_mesh` reads it. Each material in use becomes one part, named after the material; equal
     names are numbered. Textures that materials share are stored only once.
 
-    Of a glTF file, this reads metallic-roughness materials with textures, normal maps, vertex colors, two sets of
+    From a glTF file, this reads metallic-roughness materials with textures, normal maps, vertex colors, two sets of
     texture coordinates, alpha, double-sided materials, skins, morph targets, and perspective cameras, whose pictures
     are 512 pixels high. It supports the extensions KHR_materials_ior, _specular, _anisotropy, _emissive_strength,
     _clearcoat, _sheen and _transmission (thin glass), KHR_texture_transform, KHR_mesh_quantization and
@@ -98,7 +98,7 @@ def load_scene(
     cannot be read, and so on). Primitives without material get the default material of the specification, a white rough
     metal.
 
-    Of an OBJ file, this reads the materials of its MTL files: Kd, Ks, Ns, Ke, map_Kd, map_Ke, norm, and the
+    From an OBJ file, this reads the materials of its MTL files: Kd, Ks, Ns, Ke, map_Kd, map_Ke, norm, and the
     metallic-roughness statements Pr, Pm, map_Pr, map_Pm and Ni. `obj.read_mtl` explains how Phong materials and those
     of Blender are converted. A single warning names missing MTL files, materials and images and unsupported statements.
 

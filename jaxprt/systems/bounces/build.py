@@ -330,6 +330,8 @@ def _tell(contribution: np.ndarray, function: np.ndarray, worth: list[float], se
     gone = len(contribution) - len(function)
     if gone:
         left = np.linalg.norm(np.delete(contribution, function))
-        tqdm.tqdm.write(f"transfer: left out {gone} of {len(contribution)} functions, {left:.2g} of what arrives")
+        share = f"which carry {100 * left:.2g} % of the arriving light"
+        tqdm.tqdm.write(f"transfer: dropped {gone} of {len(contribution)} path functions, {share}")
     if bounces != 1 and second is None and len(worth) > 1:
-        tqdm.tqdm.write(f"transfer: left out the second bounce, {worth[1]:.2g} of the light of an open surface")
+        share = f"{100 * worth[1]:.2g} % of the light of an open surface"
+        tqdm.tqdm.write(f"transfer: dropped the second bounce, which carries {share}")

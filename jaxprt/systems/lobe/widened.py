@@ -1,4 +1,4 @@
-"""Systems with lobes that are widened at each point: what a reflection ray sees, which stands for a cone.
+"""Lobes widened by the cone of directions that each reflection ray stands for.
 
 A ray of the reflection of a glossy surface stands for a cone of directions, which meets an area of the surface that it
 hits and leaves it with a wider spread still. If that surface is read at one direction, a highlight that a few rays hit

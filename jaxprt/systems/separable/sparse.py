@@ -25,7 +25,8 @@ from jaxprt.visibility.rays import PRECOMPUTE
 
 # Versions of the algorithms. A release that changes their results raises one.
 ALGORITHM = {"visibility": visibility.rays.ALGORITHM, "separable": 1}
-_CHUNKS = 4  # per wavelet coefficient on average; longer chunks have more padding, shorter ones more sums to scatter
+# Chunks for each wavelet coefficient, on average: fewer means more padding, more means more scattered sums.
+_CHUNKS = 4
 
 
 class Transpose(eqx.Module):

@@ -244,8 +244,8 @@ def test_what_brings_little_is_left_out_and_told(mesh, changing, capsys):
     assert len(few.function) < 4
     assert few.nbytes < every.nbytes
     told = capsys.readouterr()
-    assert "left out the second bounce" in told.out + told.err
-    assert f"of {len(every.function)} functions" in told.out + told.err
+    assert "dropped the second bounce" in told.out + told.err
+    assert f"of {len(every.function)} path functions" in told.out + told.err
     np.testing.assert_allclose(few.worth[0], every.worth[0], rtol=1e-5)
     assert few.worth[1] < 0.05
 

@@ -1,4 +1,4 @@
-"""The dynamic system where something degenerates: nothing may become NaN, infinite or absurd."""
+"""The dynamic system: degenerate input gives finite, bounded radiance."""
 
 import jax
 import jax.numpy as jnp

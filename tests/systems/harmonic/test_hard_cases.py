@@ -1,4 +1,4 @@
-"""The harmonic system from end to end where something degenerates: nothing may become NaN, infinite or absurd."""
+"""The harmonic system: degenerate input gives finite, bounded radiance."""
 
 import jax
 import jax.numpy as jnp

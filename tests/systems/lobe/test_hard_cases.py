@@ -1,4 +1,4 @@
-"""The lobe system where something degenerates: nothing may become NaN, infinite or absurd."""
+"""The lobe system: degenerate input gives finite, bounded radiance."""
 
 import functools
 

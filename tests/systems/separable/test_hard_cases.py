@@ -1,4 +1,4 @@
-"""The separable system from end to end where something degenerates: nothing may become NaN, infinite or absurd."""
+"""The separable system: degenerate input gives finite, bounded radiance."""
 
 import equinox as eqx
 import jax.numpy as jnp
