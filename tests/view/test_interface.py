@@ -324,6 +324,35 @@ def test_a_picture_of_any_size_is_saved_with_alpha(hand, systems, lights, sessio
     bar.wait_for(state="hidden")
 
 
+def test_the_dialog_opens_with_what_was_saved_last_and_without_what_was_canceled(hand):
+    page = hand.page
+    fields = [page.get_by_label(name) for name in ("width in pixels", "height in pixels", "transparent background")]
+    opener, cancel = (page.get_by_role("button", name=name) for name in ("save a picture", "cancel"))
+
+    def shown():
+        opener.click()
+        return fields[0].input_value(), fields[1].input_value(), fields[2].is_checked()
+
+    first = shown()
+    canvas = hand.page.evaluate(f"() => [({CANVAS}).width, ({CANVAS}).height].map(String)")
+    assert first == (*canvas, False)
+    fields[0].fill("7")
+    fields[2].set_checked(True)
+    cancel.click()
+    assert shown() == first
+    for field in fields[:2]:
+        field.fill("8000")
+    page.get_by_role("button", name="save PNG").click()
+    page.get_by_text("a picture must have at most 16777216 pixels, got 8000 x 8000").wait_for()
+    cancel.click()
+    assert shown() == first
+    assert page.locator("dialog .note").text_content() == ""
+    cancel.click()
+    saved(hand, 20, 10, transparent=True)
+    assert shown() == ("20", "10", True)
+    cancel.click()
+
+
 def test_an_exported_page_saves_pictures_by_its_graphics_card(browser, systems, lights, tmp_path):
     piece = view.export(systems["harmonics"], tmp_path / "page.html", environments=lights)
     hand = Hand(browser, piece.path.as_uri())

@@ -123,24 +123,30 @@ function dialogOf(parent, canvas, make) {
   const cancel = element("button", end, { type: "button", textContent: "cancel", onclick: () => dialog.close() });
   const save = element("button", end, { type: "submit", className: "main", textContent: "save PNG" });
   const lock = (locked) => { for (const each of [width, height, clear, save, cancel]) each.disabled = locked; };
+  let saved = null; // the choices of the last picture that was saved
   form.onsubmit = async (event) => {
     event.preventDefault();
     lock(true);
     note.textContent = "the picture is being made";
+    const choice = { width: Number(width.value), height: Number(height.value), transparent: clear.checked };
     try {
-      const blob = await make({ width: Number(width.value), height: Number(height.value), transparent: clear.checked });
+      const blob = await make(choice);
       const link = element("a", form, { href: URL.createObjectURL(blob), download: "jaxprt.png" });
       link.click();
       link.remove();
       setTimeout(() => URL.revokeObjectURL(link.href), 60000);
+      saved = choice;
       dialog.close();
     } catch (error) { note.textContent = error.message; }
     lock(false);
   };
   return {
     open() {
-      note.textContent = "";
-      if (!width.value) [width.value, height.value] = [canvas.width, canvas.height];
+      if (!save.disabled) { // else the dialog was left while its picture is being made
+        note.textContent = "";
+        const { transparent, ...size } = saved ?? { width: canvas.width, height: canvas.height, transparent: false };
+        [width.value, height.value, clear.checked] = [size.width, size.height, transparent];
+      }
       dialog.showModal();
       width.select();
     },
