@@ -259,6 +259,23 @@ def test_the_hint_goes_away_at_first_use_and_every_key_of_the_help_acts(hand):
     assert hand.state()["background"] == state["background"]
 
 
+def test_keys_that_change_nothing_leave_the_picture_at_rest(browser, systems, lights):
+    server = Server(Session({"harmonics": systems["harmonics"]}, environments={"lamp": lights["lamp"]}))
+    hand = Hand(browser, server.url)
+    hand.still()
+    before, asked = hand.stats(), hand.state()
+    hand.page.locator("canvas.canvas").focus()
+    for key in "clsb":
+        hand.page.keyboard.press(key)
+    hand.page.wait_for_timeout(500)
+    assert {name: hand.stats()[name] for name in ("seq", "sent", "stills")} == {
+        name: before[name] for name in ("seq", "sent", "stills")
+    }
+    assert hand.state() == asked
+    hand.page.close()
+    server.close()
+
+
 @pytest.mark.parametrize("number", [0, 1])
 def test_it_starts_at_the_automatic_exposure_of_the_object(hand, systems, lights, number):
     if number:

@@ -100,9 +100,11 @@ function key(event, on) {
       "-": () => { on.camera.zoom(1 / 0.9); on.moved(); },
       "[": () => on.set({ turn: state.turn - 0.1 }), "]": () => on.set({ turn: state.turn + 0.1 }),
       ",": () => on.expose(state.stops - 0.5), ".": () => on.expose(state.stops + 0.5),
-      l: () => on.set({ light: (state.light + 1) % scene.lights.length }), s: () => on.set({ system: next, bounces: state.bounces && scene.systems[next].bounces }),
+      // What changes nothing leaves the picture at rest.
+      l: () => scene.lights.length > 1 && on.set({ light: (state.light + 1) % scene.lights.length }),
+      s: () => names.length > 1 && on.set({ system: next, bounces: state.bounces && scene.systems[next].bounces }),
       b: () => scene.systems[state.system].bounces && on.set({ bounces: !state.bounces }), g: () => on.set({ background: !state.background }),
-      p: () => on.set({ still: !state.still }), e: () => on.set({ exact: !state.exact }), c: () => on.set({ lamps: [] }), r: () => on.reset(),
+      p: () => on.set({ still: !state.still }), e: () => on.set({ exact: !state.exact }), c: () => state.lamps.length && on.set({ lamps: [] }), r: () => on.reset(),
       a: () => on.automatic(true), h: () => on.toggleHelp(), escape: () => on.help.hidden || on.toggleHelp(),
     }[event.key.toLowerCase()];
     if (!act) return false;
