@@ -18,6 +18,7 @@ from jaxprt.cli.options import option
 from jaxprt.relit import RelitScene
 from jaxprt.relit.build import precompute
 from jaxprt.scene import Environment, Scene
+from jaxprt.view.progress import COMPILING
 from jaxprt.view.server import Server, parse
 from jaxprt.view.session import Session
 from jaxprt.view.unshadowed import Unshadowed
@@ -36,6 +37,14 @@ _STAGES = {
     "bounce": "tracing the first bounce",
     "bounce 2": "tracing the second bounce",
 }
+# Parts of the time that stages take, roughly: those before the rays of a system, and after them.
+_PREVIEW, _DIVISION, _RAYS, _REFLECTION, _COMPILING = (
+    0.05,
+    0.3,
+    1.0,
+    (("response", 0.1), ("patches", 0.2), ("bounce", 0.3)),
+    0.3,
+)
 
 
 @click.command(cls=options.Command, short_help="Show a scene in the interactive viewer in a browser.")
@@ -182,6 +191,7 @@ def prepare(session: Session, chosen: SimpleNamespace) -> None:
         for system in chosen.system
         for name, recipe in options.recipes(system, chosen, lobes=LOBES).items()
     }
+    session.progress.plan(_way(len(recipes), refine=bool(refine), bounces=bool(chosen.bounces)))
     report("evaluating materials", None)
     first, (_, recipe) = next(iter(recipes.items()))
     session.show_unshadowed(Unshadowed.of(scene, recipe), name=first, environments=lights)
@@ -199,6 +209,16 @@ def prepare(session: Session, chosen: SimpleNamespace) -> None:
         session.show(systems, preview=len(systems) < len(recipes))
     vertices = len(next(iter(systems.values())).mesh.position)
     click.echo(f"jaxprt: ready after {time.perf_counter() - began:.1f} s, {vertices:,} vertices", err=True)
+
+
+def _way(systems: int, *, refine: bool, bounces: bool) -> list[tuple[str, float]]:
+    """The stages of `prepare`, each with its part of the time. The first system has previews."""
+    stages = []
+    for number in range(systems):
+        preview = [("visibility", _PREVIEW)] if number == 0 else []
+        division = [("refine", _DIVISION), *preview] if refine else []
+        stages += [*preview, *division, ("visibility", _RAYS), *(_REFLECTION if bounces else ())]
+    return [*((_STAGES[name], part) for name, part in stages), (COMPILING, _COMPILING)]
 
 
 def precompute_scene(

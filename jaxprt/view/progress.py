@@ -3,8 +3,10 @@
 import os
 import sys
 import threading
+from collections.abc import Sequence
 from typing import Any
 
+COMPILING = "compiling programs for changes"  # the last stage, after which the scene is complete
 _LOWER = 10  # by which the priority of a thread is reduced
 
 
@@ -20,8 +22,18 @@ class Progress:
         self._changed = threading.Condition()
         self._stage: str = "starting"
         self._share: float | None = None
+        self._way: _Way | None = None
         self._error: BaseException | None = None
         self._prepared = self._finished = self._told = False
+
+    def plan(self, stages: Sequence[tuple[str, float]]) -> None:
+        """Sets what will be done, so that the page shows one share for the whole way. It never falls.
+
+        Args:
+            stages: The stages in their order, each with its part of the time. Some may be left out, and others come.
+        """
+        with self._changed:
+            self._way = _Way(stages)
 
     def report(self, stage: str, share: float | None) -> None:
         """Sets what is being done, and which share of it is done, from 0 to 1; None if nobody knows.
@@ -31,6 +43,8 @@ class Progress:
         with self._changed:
             done = share is not None and share >= 1
             self._stage, self._share = ("preparing the scene", None) if done else (stage, share)
+            if self._way is not None:
+                self._share = self._way.share(stage, share)
 
     def prepared(self) -> None:
         """The scene is complete. What follows makes it only faster."""
@@ -78,6 +92,35 @@ class Progress:
             self._told = True
             self._changed.notify_all()
             return content | {"error": str(self._error) or type(self._error).__name__}
+
+
+class _Way:
+    """The share of all stages that is done.
+
+    A stage that is reported anew, or again from its start, takes its planned part of what was left before it. A stage
+    that was not planned takes none, and the share waits.
+    """
+
+    def __init__(self, stages: Sequence[tuple[str, float]]):
+        self._left = list(stages)
+        self._stage, self._within = "", 0.0
+        self._done = self._first = self._last = 0.0
+
+    def share(self, stage: str, share: float | None) -> float | None:
+        """The share of the whole way, given that of a stage; None before anything is done."""
+        if share is not None:
+            if stage != self._stage or share < self._within:
+                self._begin(stage)
+            self._stage, self._within = stage, share
+            self._done = max(self._done, self._first + (self._last - self._first) * share)
+        return self._done or None
+
+    def _begin(self, stage: str) -> None:
+        self._first = self._last = self._done
+        place = next((number for number, (name, _) in enumerate(self._left) if name == stage), None)
+        if place is not None:
+            (_, part), *self._left = self._left[place:]
+            self._last += (1 - self._done) * part / (part + sum(other for _, other in self._left))
 
 
 def yield_cores() -> None:

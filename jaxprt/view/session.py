@@ -28,7 +28,7 @@ from jaxprt.scene.mesh import bounds
 from jaxprt.view import messages, stages
 from jaxprt.view.content import light_texels, mip_edges, page_content, unshadowed_content
 from jaxprt.view.messages import Lamp, Look, Reply
-from jaxprt.view.progress import EndedError, Progress, yield_cores
+from jaxprt.view.progress import COMPILING, EndedError, Progress, yield_cores
 from jaxprt.view.reduced import PageScene
 from jaxprt.view.stages import Stages
 from jaxprt.view.unshadowed import Unshadowed
@@ -200,7 +200,7 @@ class Session:
             make()
             self.progress.prepared()
             for share in self.stages.rehearsal(*self._size) if self.version else ():
-                self.report("compiling programs for changes", share)
+                self.report(COMPILING, share)
         except EndedError:
             pass
         except BaseException as error:

@@ -9,7 +9,7 @@ from jax._src import compiler
 
 from jaxprt import files
 from jaxprt.view import Server, Session
-from jaxprt.view.progress import EndedError
+from jaxprt.view.progress import EndedError, Progress
 from tests.view.hand import CANVAS
 
 
@@ -67,6 +67,26 @@ def test_a_better_scene_has_a_higher_version_and_the_lights_that_were_dropped_me
     assert (scene["version"], scene["rests"]) == (2, ["still", "exact", "picture"])
     assert scene["lights"] == ["lamp", "gray", "new"]
     assert empty.answer(look | {"light": 2, "version": 2}).content["kind"] == "color"
+
+
+def test_the_share_of_the_whole_way_never_falls_and_ends_at_one():
+    told = Progress()
+    told.plan([("rays", 0.1), ("divide", 0.4), ("rays", 0.1), ("rays", 1.0), ("compile", 0.4)])
+
+    def share(stage, part):
+        told.report(stage, part)
+        return told.content()["fraction"]
+
+    assert share("read", None) is None
+    way = [("rays", 0.0), ("rays", 0.5), ("rays", 1.0), ("divide", 0.0), ("divide", 0.5), ("divide", 1.0)]
+    shares = [share(*step) or 0.0 for step in way]
+    np.testing.assert_allclose(shares, [0.0, 0.025, 0.05, 0.05, 0.15, 0.25])
+    # What was not planned, and what nobody can measure, leave it where it is.
+    assert [share("pack", 0.7), share("think", None)] == pytest.approx([0.25, 0.25])
+    # The same stage again, and rays that come once less than planned.
+    np.testing.assert_allclose([share("rays", 0.5), share("rays", 1.0), share("compile", 0.0)], [0.275, 0.3, 0.3])
+    assert [share("compile", 0.5), share("compile", 1.0)] == pytest.approx([0.65, 1.0])
+    assert share("rays", 0.0) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("kind", ["look", "still", "exact"])
