@@ -28,7 +28,7 @@ from jaxprt.scene import mesh as meshes
 from jaxprt.scene.camera import orbit
 from jaxprt.scene.environment import rotate
 from jaxprt.scene.formats.mesh_file import SUFFIXES
-from jaxprt.scene.scene import centered, unique_names
+from jaxprt.scene.scene import centered, default_camera, unique_names
 from jaxprt.scene.sides import two_sided
 
 # Loader of each kind of file, and its further options: True for required ones.
@@ -329,16 +329,18 @@ def _load_scenes(paths: Sequence[Path], options: SimpleNamespace, playable: bool
     if options.brdf is not None:  # vertex colors belong to the file's material
         parts = [Part(part.name, part.mesh, options.brdf) for part in parts]
     parts = [dataclasses.replace(part, name=name) for name, part in zip(names, parts, strict=True)]
+    cameras = scenes[0].cameras if options.up == "y" else []
     if options.ground:
         matte: Callable = _matte if playable else Lambert
-        name = unique_names([*names, "ground"])[-1]
-        parts.append(Part(name, meshes.ground_plane(Scene(parts).mesh), matte(0.5)))
+        name, alone = unique_names([*names, "ground"])[-1], Scene(parts)
+        parts.append(Part(name, meshes.ground_plane(alone.mesh), matte(0.5)))
+        cameras = cameras or [default_camera(alone, alone.mesh)]  # of the object, which the ground is wider than
     if options.up != "y":
-        return Scene(parts)
+        return Scene(parts, cameras)
     lamps = [lamp for loaded in scenes for lamp in loaded.point_lights]
     names = unique_names([*(part.name for part in parts), *(lamp.name for lamp in lamps)])[len(parts) :]
     lamps = [dataclasses.replace(lamp, name=name) for name, lamp in zip(names, lamps, strict=True)]
-    return Scene(parts, scenes[0].cameras, point_lights=lamps)
+    return Scene(parts, cameras, point_lights=lamps)
 
 
 def _number(names: Sequence[str], name: str) -> int:

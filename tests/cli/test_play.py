@@ -7,6 +7,7 @@ import threading
 import urllib.parse
 from types import SimpleNamespace
 
+import equinox as eqx
 import numpy as np
 import pytest
 
@@ -14,7 +15,7 @@ import jaxprt as prt
 from jaxprt import files
 from jaxprt.cli import inputs, play
 from jaxprt.cli.main import program
-from jaxprt.view import messages
+from jaxprt.view import Session, messages
 from jaxprt.view.progress import Progress
 
 OBJ = "v 0 1 0\nv -1 -0.5 1\nv 1 -0.5 1\nv 0 -0.5 -1\nf 1 2 3\nf 1 3 4\nf 1 4 2\nf 2 4 3\n"
@@ -54,6 +55,32 @@ def test_files_are_told_by_their_names_and_parts_without_a_material_are_plastic(
     assert len({part.name for part in scene.parts}) == 3
     assert [float(part.material.specular) for part in scene.parts] == [1, 1, 0]
     assert list(inputs.lights(given)) == ["sky"]
+
+
+def test_the_first_camera_frames_the_object_and_not_the_ground_below(place):
+    given = [str(place / name) for name in ("first.obj", "sky.exr")]
+    alone, grounded = (inputs.scene(options(*given, *more)) for more in ((), ("--ground",)))
+    expected = prt.scene.camera.orbit(alone.mesh, azimuth=0.5, elevation=0.3)
+    assert eqx.tree_equal(grounded.cameras, (expected,))
+    assert not alone.cameras
+    low, high = (np.ptp(np.asarray(scene.mesh.position), axis=0).max() for scene in (alone, grounded))
+    assert high > 2 * low
+
+
+def test_previews_divided_meshes_and_systems_are_one_way(place, monkeypatch):
+    session, shares = Session(), []
+    report = session.report
+
+    def heard(stage, share):
+        report(stage, share)
+        shares.append(session.progress.content()["fraction"])
+
+    monkeypatch.setattr(session, "report", heard)
+    play.prepare(session, options(str(place / "first.obj"), "--lobes", "1,2", "--light-size", "8", "--bounces", "1"))
+    told = [share for share in shares if share is not None]
+    assert len(told) > 4
+    assert told == sorted(told)
+    assert 0.5 < told[-1] < 1
 
 
 def test_without_files_there_are_the_chess_pieces_in_two_lights():
