@@ -324,7 +324,7 @@ def _header(content: bytes, name: str) -> _Header:
     match = _RESOLUTION.fullmatch(line)
     if not blank or not end or match is None or match[2] == match[5]:
         raise ValueError(
-            f"{name} must be an undamaged hdr file with a resolution such as -Y 8 +X 16, got {line[:40]!r}"
+            f"{name} must be an undamaged hdr file with a resolution such as -Y 8 +X 16, got {_quoted(line[:40])}"
         )
     attributes = _attributes(head.decode("latin-1"), name)
     if attributes.get("FORMAT", "32-bit_rle_rgbe") != "32-bit_rle_rgbe":
@@ -581,7 +581,7 @@ def _read(
     if (start[:4], start[8:12]) == _WEBP:
         form = "webp"
     if form is None:
-        got = f"one that starts with {start[:8]!r}" if start else "an empty file"
+        got = f"one that starts with {_quoted(start[:8])}" if start else "an empty file"
         raise ValueError(f"{name} must be an EXR, HDR, PNG, JPEG, TIFF, PFM, BMP, WebP or KTX 2 image, got {got}")
     try:
         if form == "openexr":
@@ -593,6 +593,13 @@ def _read(
         return _read_other(path, name, form, decoded=decoded)
     except MemoryError as error:  # NumPy's does not name the file, where a process may use less than is free.
         raise error if name in str(error) else MemoryError(f"{name} must fit into memory, got: {error}") from error
+
+
+def _quoted(start: bytes) -> str:
+    """Bytes of a file for a message: as text if they are text, otherwise as hexadecimal numbers."""
+    if start.isascii() and (text := start.decode("ascii").strip()).isprintable():
+        return f"the text {text!r}"
+    return f"the bytes {start.hex(' ')}"
 
 
 def _read_other(

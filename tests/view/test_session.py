@@ -313,7 +313,12 @@ def test_a_dropped_file_becomes_a_light(session, look, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "data", "words"),
-    [("notes.txt", b"no light", "notes.txt"), ("a.exr", b"\x76\x2f\x31\x01 cut", "a.exr"), ("b.hdr", b"", "no bytes")],
+    [
+        ("notes.txt", b"no light", "one that starts with the text 'no light'"),
+        ("c.exr", b"\x00\xff", "the bytes 00 ff"),
+        ("a.exr", b"\x76\x2f\x31\x01 cut", "a.exr"),
+        ("b.hdr", b"", "no bytes"),
+    ],
 )
 def test_files_that_are_no_environment_are_refused_by_name(session, look, name, data, words):
     reply = session.answer({"kind": "drop", "name": name}, [data])
