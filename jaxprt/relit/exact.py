@@ -69,10 +69,14 @@ class ExactPicture(NamedTuple):
     Attributes:
         camera: The requested camera, or the same one with fewer pixels.
         color: Linear radiance of the picture under each light.
+        surface: Linear radiance of the surfaces alone: the picture in front of black.
+        alpha: Fraction of each pixel that shows surfaces.
     """
 
     camera: Camera
     color: Float[np.ndarray, "l h w c"]
+    surface: Float[np.ndarray, "l h w c"]
+    alpha: Float[np.ndarray, "h w"]
 
 
 def exact_pixels(
@@ -215,9 +219,11 @@ def exact_picture(
     color = color[..., :colors]
     behind = [jnp.broadcast_to(sky(light, camera), (camera.height, camera.width, colors)) for light in environments]
     pictures = [resolve(shown.pixels, a, background=b) for a, b in zip(color, behind, strict=True)]
+    surfaces, empty = [resolve(shown.pixels, light) for light in color], np.asarray(shown.pixels.background)
+    alpha = 1 - (empty if empty.ndim == 2 else empty.mean(-1))
     if (camera.width, camera.height) != (asked.width, asked.height):
         asked = dataclasses.replace(asked, width=camera.width, height=camera.height)
-    return ExactPicture(asked, np.stack(pictures))
+    return ExactPicture(asked, np.stack(pictures), np.stack(surfaces), alpha)
 
 
 def _hidden_faces(scene: Scene, mesh: Mesh) -> Bool[np.ndarray, " f"]:

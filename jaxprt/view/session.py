@@ -359,7 +359,7 @@ class Session:
         make = shown.cutout if clear else shown.picture
         picture = make(look, width, height, samples=1 if coarse else 4, between=between)
         data, scale = messages.encode(picture[..., :3], stops=_stops(message), tone=_tone(message))
-        alpha = [zlib.compress(np.round(255 * picture[..., 3]).astype(np.uint8).tobytes(), 1)] if clear else []
+        alpha = [_alpha(picture)] if clear else []
         spent = 1000 * (time.perf_counter() - began)
         size = {"width": width, "height": height}
         return Reply({"kind": "still", "seq": seq, "scale": scale, "ms": spent, **size}, [data, *alpha])
@@ -378,9 +378,11 @@ class Session:
             error, spread = pixels.relative_l2(shown.direct_picture(look, width, height, between=between))
             told = {"error": error, "spread": spread} if np.isfinite([error, spread]).all() else {}
         truth = exact.exact_picture(*arguments, between=between)
-        data, scale = messages.encode(truth.color[0], stops=_stops(message), tone=_tone(message))
-        size = {"width": truth.camera.width, "height": truth.camera.height}
-        return Reply({"kind": "still", "seq": seq, "scale": scale, "exact": True, **told, **size}, [data])
+        clear = messages.truth(message, "transparent")
+        picture = stages.straight(truth.surface[0], truth.alpha[..., None]) if clear else truth.color[0]
+        data, scale = messages.encode(picture[..., :3], stops=_stops(message), tone=_tone(message))
+        size, alpha = {"width": truth.camera.width, "height": truth.camera.height}, [_alpha(picture)] if clear else []
+        return Reply({"kind": "still", "seq": seq, "scale": scale, "exact": True, **told, **size}, [data, *alpha])
 
     def _picture(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
         """A PNG file of a picture of any size. Newer looks do not abandon it."""
@@ -445,6 +447,11 @@ class Session:
                 raise _LateError
 
         return between
+
+
+def _alpha(picture: Float[np.ndarray, "h w 4"]) -> bytes:
+    """The alpha of a picture in bytes, compressed."""
+    return zlib.compress(np.round(255 * picture[..., 3]).astype(np.uint8).tobytes(), 1)
 
 
 def _hidden_faces(scene: RelitScene | Unshadowed) -> Bool[np.ndarray, " f"]:

@@ -173,9 +173,7 @@ class Stages:
         system, eye = self.system(look), camera(look, width, height)
         options = {"samples": samples, "background": None, "between": between}
         picture = np.asarray(system.picture(self.environment(look), eye, materials=self.materials(look), **options))
-        color, alpha = picture[..., :-1], picture[..., -1:]
-        straight = np.divide(color, alpha, out=np.zeros(color.shape, np.float32), where=alpha > 0)
-        return np.concatenate([np.broadcast_to(straight, (height, width, 3)), alpha], -1)
+        return straight(picture[..., :-1], picture[..., -1:])
 
     def direct_picture(self, look: Look, width: int, height: int, *, between: Between) -> Float[np.ndarray, "h w 3"]:
         """The picture under direct light of the environment only."""
@@ -256,6 +254,12 @@ def counterclockwise(mesh: Mesh) -> UInt32[np.ndarray, "f 3"]:
     clockwise = np.sum(np.cross(edge, other) * normal[face].sum(1), -1) < 0
     face[clockwise] = face[clockwise][:, ::-1]
     return face
+
+
+def straight(color: Float[np.ndarray, "h w c"], alpha: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 4"]:
+    """Colors that are multiplied by alpha, divided by it, and alpha. They are 0 where nothing is seen."""
+    result = np.divide(color, alpha, out=np.zeros(color.shape, np.float32), where=alpha > 0)
+    return np.concatenate([np.broadcast_to(result, (*color.shape[:2], 3)), alpha], -1)
 
 
 def about(angle: float) -> Float[Array, "3 3"]:

@@ -181,6 +181,19 @@ def test_the_exact_picture_comes_with_the_error_of_the_other(session, look):
     assert image.relative_l2(halves(still), halves(reply)) < 0.5
 
 
+def test_the_exact_picture_without_a_background_has_none(session, systems, lights, look):
+    asked = look | {"kind": "exact", "width": 24, "height": 16, "eye": [6.0, 2.0, 8.0]}
+    whole, clear = (session.answer(asked | {"transparent": each}) for each in (False, True))
+    camera = Camera(asked["eye"], look["target"], [0.0, 1.0, 0.0], look["field_of_view"], 24, 16)
+    cover = np.asarray(systems["lobes"].coverage(camera)).reshape(-1, 1)
+    alpha = np.frombuffer(zlib.decompress(clear.buffers[1]), np.uint8).reshape(-1, 1) / 255
+    np.testing.assert_allclose(alpha, cover, atol=0.6 / 255)
+    assert {0.0, 1.0} < set(cover.ravel().tolist())
+    assert not halves(clear)[cover[:, 0] == 0].any()
+    behind = np.asarray(prt.image.sky(lights["lamp"], camera)).reshape(-1, 3)
+    near(cover * halves(clear) + (1 - cover) * behind, halves(whole))
+
+
 def test_pictures_are_given_up_when_a_later_look_has_come(session, look):
     session.answer(look | {"seq": 5})
     for kind in ("still", "exact"):

@@ -196,7 +196,7 @@ export function mount(root, ask) {
     if (state.exact) steps.push(["exact", true], ["exact", false]);
     try {
       for (const [kind, coarse] of steps) {
-        const asked = { ...message(kind), ...size, coarse, transparent: kind === "still" && !state.background }, words = "computing the picture at pixels";
+        const asked = { ...message(kind), ...size, coarse, transparent: !state.background }, words = "computing the picture at pixels";
         const { content, buffers } = await waiting.during("still", kind === "still" ? words : "computing the exact picture", ask(asked));
         if (closed) break;
         if (unanswered) { unanswered = false; tell(""); }
