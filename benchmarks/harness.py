@@ -74,7 +74,7 @@ def measure(function: Callable[[], Any], *, repeats: int) -> Timing:
     Raises:
         ValueError: There are no repeats.
     """
-    return _alternate([function], repeats)[0]
+    return alternate([function], repeats=repeats)[0]
 
 
 def compare(function: Callable[[], Any], peer: Callable[[], Any], *, repeats: int) -> tuple[Timing, Timing]:
@@ -114,7 +114,16 @@ def alternate(functions: Sequence[Callable[[], Any]], *, repeats: int) -> list[T
     Raises:
         ValueError: There are no repeats.
     """
-    return _alternate(list(functions), repeats)
+    if repeats < 1:
+        raise ValueError(f"repeats must be at least 1, got {repeats}")
+    first = [_seconds(function) for function in functions]
+    times: list[list[float]] = [[] for _ in functions]
+    for _ in range(repeats):
+        for function, calls in zip(functions, times, strict=True):
+            if len(functions) > 1:
+                jax.block_until_ready(function())
+            calls.append(_seconds(function))
+    return [_timing(call, calls) for call, calls in zip(first, times, strict=True)]
 
 
 def report(line: Mapping[str, Any], output: pathlib.Path | None = None) -> dict[str, Any]:
@@ -169,19 +178,6 @@ def peak_memory() -> int:
     """Largest resident set of this process so far, in bytes; what a GPU holds is not in it."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak  # macOS counts bytes, Linux KiB.
-
-
-def _alternate(functions: list[Callable[[], Any]], repeats: int) -> list[Timing]:
-    if repeats < 1:
-        raise ValueError(f"repeats must be at least 1, got {repeats}")
-    first = [_seconds(function) for function in functions]
-    times: list[list[float]] = [[] for _ in functions]
-    for _ in range(repeats):
-        for function, own in zip(functions, times, strict=True):
-            if len(functions) > 1:
-                jax.block_until_ready(function())
-            own.append(_seconds(function))
-    return [_timing(each, own) for each, own in zip(first, times, strict=True)]
 
 
 def _timing(first: float, times: list[float]) -> Timing:

@@ -123,6 +123,13 @@ def test_compare_alternates_and_warms_each():
     assert "".join(order) == "ab" + 3 * "aabb"
 
 
+def test_several_functions_are_timed_in_turn():
+    order = []
+    timings = harness.alternate([lambda name=name: order.append(name) for name in "abc"], repeats=2)
+    assert "".join(order) == "abc" + 2 * "aabbcc"
+    assert [timing.repeats for timing in timings] == [2, 2, 2]
+
+
 def test_repeats_must_be_positive():
     with pytest.raises(ValueError, match="at least 1, got 0"):
         harness.measure(lambda: None, repeats=0)
