@@ -650,7 +650,7 @@ def _join_points(layers: list[Pixels]) -> Pixels:
 
 
 def sky(environment: Environment, camera: Camera) -> Float[Array, "h w c"]:
-    """What the pixels of a camera show of an environment where nothing hides it.
+    """The environment as the pixels of a camera see it where nothing hides it.
 
     It comes from the pixels of the environment's file, averaged over the pixels of the picture, as
     `jaxprt.scene.environment.sky` says.

@@ -54,7 +54,7 @@ def _exposure(value: Any) -> Any:
 
 
 class Picture(eqx.Module):
-    """A picture of the object. NumPy arrays become arrays.
+    """A picture of the object. NumPy arrays become JAX arrays.
 
     Attributes:
         image: Linear pixel values: radiance times the exposure.

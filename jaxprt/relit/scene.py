@@ -234,7 +234,7 @@ class RelitScene(System):
 
     @promoted
     def view(self, eye: Float[Array | np.ndarray, "3"], materials: Mapping[str, Any] | None = None) -> SceneView:
-        """What depends on the eye and the materials, for all groups.
+        """The factor of radiance that depends on the eye and the materials, for all groups.
 
         Raises:
             TypeError: `materials` is not a dictionary; a material is of a kind that its part does not take; or the
