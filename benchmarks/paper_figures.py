@@ -1,42 +1,83 @@
-"""Pictures for the figures of Sun et al. 2007, from the scenes of `benchmarks.paper_scenes`.
+"""Pictures and numbers for the figures of Sun et al. 2007 with reflected light, of scenes of `benchmarks.paper_scenes`.
 
-Each figure is a dictionary from titles to pictures in linear radiance, with coverage as fourth channel, made by
-changing what the paper's caption says is changed: light, view or material. Pictures are made at pixels: what arrives is
-that of the vertices, interpolated; BRDF, view and lobes are the pixel's own. `traced` has Mitsuba's pictures of the
-same scenes.
-
-    python -m benchmarks.paper_figures FOLDER [--store FOLDER] [--only FIGURE...]     write them as PNG
+Each figure is a `Sheet`: pictures in linear radiance with coverage as fourth channel, by their captions, and lines of
+what was measured in the region that the paper's statement is about. What is changed is what the paper's caption says:
+light, view or material. Pictures are made at pixels: what arrives is that of the vertices, interpolated; BRDF, view and
+lobes are the pixel's own. `benchmarks.figures` draws the sheets and writes the lines.
 """
 
-import argparse
 import pathlib
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import paper_scenes, path_tracing
+from benchmarks.figures import drawing
 from benchmarks.paper_recipes import RECIPES, Look
 from benchmarks.paper_scenes import Made
-from jaxprt import RelitScene, files, image
+from benchmarks.published import interiors
+from jaxprt import image
 from jaxprt.brdf import Lambert
-from jaxprt.image import raster
 from jaxprt.relit.groups import joined_mesh
-from jaxprt.scene import Camera, Environment
-from jaxprt.scene.environment import background
+from jaxprt.scene import Camera, Environment, builtin
+from jaxprt.scene.environment import add_disk
+from jaxprt.sphere import cubemap
 
-SAMPLES = 1024  # of Mitsuba's pixels
+EDGE, SAMPLES = 448, 144  # pixels along the edge of a picture, and samples of Mitsuba's in each of two pictures
+LAYERS = ("color", "direct", "reflected", "alpha", "normal", "position", "part")
+# Round lamps in dim light from everywhere: direction, radius in degrees, and radiance of the dim light.
+LAMPS = {
+    "bust": ((-0.55, 0.75, 0.55), 8, 0.05),
+    "bird": ((0.5, 1.2, -0.2), 12, 0.05),
+    "chess": ((-0.35, 0.62, -1.0), 12, 0.02),
+    "watch": ((-0.6, 0.9, 0.5), 14, 0.3),
+}
+BIRD: Look = {0: ([0.75, 0.7, 0.5], 0.1, [0.05, 0.4]), 1: ([0.03, 0.12, 0.75], 0.05, [0.05, 0.4])}
+BELOW = ((-0.42, 0.07, 0.42), (0.0, -0.02, 0.0), 0.55)  # a camera that sees the chest of the bird
+METALS = {  # specular weights of case and bracelet, and roughness
+    "steel": ([0.72, 0.73, 0.76], [0.72, 0.73, 0.76], 0.2),
+    "gold": ([1.0, 0.72, 0.28], [1.0, 0.72, 0.28], 0.15),
+    "copper and steel": ([0.93, 0.5, 0.35], [0.72, 0.73, 0.76], 0.25),
+    "black steel": ([0.12, 0.12, 0.14], [0.12, 0.12, 0.14], 0.35),
+}
+_RUST, _GOLD = np.array([0.6, 0.14, 0.05]), np.array([1.0, 0.72, 0.28])
+_STRONGER = 3  # how many times what the bust sends to the walls is shown
+_RAYS = 16  # of mirror images, for each pixel
+_FACING = 0.1  # least cosine by which a surface looks away from the lamp, or down
 
 
-def picture(
-    scene: RelitScene, *, camera: Camera, light: Environment, materials: Mapping[str, Any] | None = None
-) -> np.ndarray:
-    """A picture of a scene, anti-aliased, in linear radiance before black, with coverage."""
-    coverage = scene.coverage(camera)[..., None]
-    seen = scene.picture(light, camera, materials=materials)
-    sky = (1 - coverage) * background(light, raster.ray_direction(camera))
-    return np.asarray(jnp.concatenate([seen - sky, coverage], -1))
+class Sheet(NamedTuple):
+    """A figure.
+
+    Attributes:
+        pictures: Pictures [h, w, 4] by their captions: linear radiance before black, and coverage.
+        lines: What was measured.
+        like: The picture whose exposure all have; the last if None.
+    """
+
+    pictures: dict[str, np.ndarray]
+    lines: list[dict[str, Any]]
+    like: np.ndarray | None = None
+
+
+def soft_box(direction: Any, degrees: float, dim: float, *, size: int) -> Environment:
+    """A round lamp in dim light from everywhere.
+
+    Args:
+        direction: Direction towards the lamp.
+        degrees: Its angular radius.
+        dim: Radiance of the light from everywhere.
+        size: Texels along the edge of the light's faces.
+
+    Returns:
+        Light in three colors. A white diffuse surface that faces it has a radiance of 1 + dim without shadows.
+    """
+    angle = np.radians(degrees)
+    light = Environment(jnp.full((6, size, size, 3), dim, jnp.float32))
+    return add_disk(light, np.asarray(direction, float), angle=float(angle), radiance=float(1 / np.sin(angle) ** 2))
 
 
 def models(made: Made, changed: Look | None = None) -> list[Any]:
@@ -47,168 +88,418 @@ def models(made: Made, changed: Look | None = None) -> list[Any]:
 
 
 def traced(
-    made: Made, changed: Look | None = None, *, camera: Camera, bounces: int = 2, samples: int = SAMPLES, seed: int = 0
+    made: Made,
+    changed: Look | None = None,
+    *,
+    camera: Camera,
+    light: Environment | None = None,
+    bounces: int = 2,
+    samples: int = SAMPLES,
+    seed: int = 0,
 ) -> np.ndarray:
     """Mitsuba's picture of a scene with so many bounces, with the coverage of ours."""
-    found = path_tracing.picture(
+    radiance = path_tracing.picture(
         joined_mesh(made.scene.shading),
         models(made, changed),
-        paper_scenes.light_of(made),
+        paper_scenes.light_of(made) if light is None else light,
         camera,
         depth=2 + bounces,
         samples=samples,
         seed=seed,
     )
-    return np.concatenate([found, made.scene.coverage(camera)[..., None]], -1)
+    return np.concatenate([radiance, made.scene.coverage(camera)[..., None]], -1)
 
 
-def off(mine: np.ndarray, exact: np.ndarray) -> float:
-    """Relative L2 of a picture against another, noise included, over the pixels that the scene fills."""
+def off(mine: np.ndarray, exact: np.ndarray, where: np.ndarray | None = None) -> float:
+    """Relative L2 of a picture against another, noise included, over the pixels that the scene fills.
+
+    `where` has those that count, [h, w]; None for all.
+    """
     inside = (exact[..., 3] == 1) & (mine[..., 3] == 1)
+    inside = inside if where is None else inside & where
     return float(np.linalg.norm((mine - exact)[inside]) / np.linalg.norm(exact[inside, :3]))
 
 
-class Figures:
-    """The figures of the paper; `quick` makes small ones of small scenes, `store` keeps what is precomputed."""
+class Exact(NamedTuple):
+    """Mitsuba's picture as two of independent noise, so that noise does not count as error.
 
-    def __init__(self, *, quick: bool = False, store: pathlib.Path | None = None):
+    Attributes:
+        first: One half of the samples.
+        second: The other half.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+
+    @property
+    def picture(self) -> np.ndarray:
+        """The mean of both."""
+        return (self.first + self.second) / 2
+
+    def off(self, mine: np.ndarray, where: np.ndarray | None = None) -> float:
+        """Relative L2 of a picture over some pixels that the scene fills, all if None, without the noise of the halves.
+
+        The mean product of the differences from two pictures of independent noise is the square of the difference from
+        their expectation.
+        """
+        inside = (mine[..., 3] == 1) & (self.first[..., 3] == 1)
+        inside = inside if where is None else inside & where
+        one, other, ours = (each[inside][:, :3].astype(np.float64) for each in (self.first, self.second, mine))
+        square, whole = np.sum((ours - one) * (ours - other)), np.sum(one * other)
+        return float(np.sqrt(max(square, 0.0) / whole))
+
+
+def mean(picture: np.ndarray, where: np.ndarray) -> float:
+    """Mean radiance of some pixels, over the colors."""
+    return float(np.mean(picture[where][:, :3]))
+
+
+def share(value: float) -> str:
+    """A number as percent."""
+    return f"{100 * value:.0f} %" if value >= 0.095 else f"{100 * value:.1f} %"
+
+
+class Layers(NamedTuple):
+    """A picture and what it is made of, by pixel.
+
+    Attributes:
+        color: Direct and reflected light, with coverage.
+        direct: Direct light alone, with coverage.
+        normal: Unit normals, where a surface covers the pixel.
+        position: Where that surface is.
+        part: Its part, -1 for none.
+    """
+
+    color: np.ndarray
+    direct: np.ndarray
+    normal: np.ndarray
+    position: np.ndarray
+    part: np.ndarray
+
+    def region(self, *parts: int, toward: Any = None) -> np.ndarray:
+        """Pixels that some parts cover, [h, w]; those that face a direction by a cosine of 0.1 or more."""
+        inside = np.isin(self.part, parts) & (self.color[..., 3] == 1)
+        if toward is None:
+            return inside
+        axis = np.asarray(toward, float) / np.linalg.norm(toward)
+        return inside & (self.normal @ axis > _FACING)
+
+
+class Figures:
+    """The figures of the paper; `quick` makes small ones of small scenes, `store` keeps what is precomputed.
+
+    `compare` says whether Mitsuba's pictures stand beside ours, with errors against them.
+    """
+
+    def __init__(self, *, quick: bool = False, store: pathlib.Path | None = None, compare: bool = False):
         """Nothing is computed yet."""
-        self.quick, self.store, self.made = quick, store, {}
-        self.edge = 16 if quick else paper_scenes.EDGE
+        self.quick, self.store, self.compare, self.scenes = quick, store, compare, {}
+        self.edge, self.samples = (16, 4) if quick else (EDGE, SAMPLES)
 
     def scene(self, name: str, **options: Any) -> Made:
         """A scene that is ready, made once."""
         key = name, tuple(options.items())
-        if key not in self.made:
-            self.made[key] = paper_scenes.prepare(name, quick=self.quick, store=self.store, **options)
-        return self.made[key]
+        if key not in self.scenes:
+            self.scenes[key] = paper_scenes.prepare(name, quick=self.quick, store=self.store, **options)
+        return self.scenes[key]
 
     def camera(self, made: Made, **options: Any) -> Camera:
         """The camera of a scene."""
         return paper_scenes.camera_of(made.recipe, made.scene.mesh, edge=self.edge, **options)
 
-    def drawn(
+    def lamp(self, made: Made) -> Environment:
+        """The lamp of a scene."""
+        size = made.scene.light_size
+        assert size is not None
+        return soft_box(*LAMPS[made.name], size=size)
+
+    def layers(
         self,
         made: Made,
         changed: Look | None = None,
         *,
-        turn: float = 0.0,
-        lit: float = 0.0,
-        scene: RelitScene | None = None,
-    ) -> np.ndarray:
-        """A picture with the view or the light turned, other materials, or without a part of the light."""
-        light = paper_scenes.turned(paper_scenes.light_of(made), lit)
-        camera, scene = self.camera(made, turn=turn), made.scene if scene is None else scene
-        return picture(scene, camera=camera, light=light, materials=made.materials(changed))
+        light: Environment | None = None,
+        camera: Camera | None = None,
+        rays: int = 0,
+    ) -> Layers:
+        """A picture with other materials, in the light of the scene's recipe unless another one is given."""
+        layers = made.scene.with_rays(rays).picture(
+            paper_scenes.light_of(made) if light is None else light,
+            self.camera(made) if camera is None else camera,
+            materials=made.materials(changed),
+            background=None,
+            layers=list(LAYERS),
+        )
+        layer = {name: np.asarray(value) for name, value in layers.items()}
+        alpha = layer["alpha"][..., None]
+        color, direct = (np.concatenate([layer[name][..., :3], alpha], -1) for name in ("color", "direct"))
+        normal = layer["normal"] / np.maximum(np.linalg.norm(layer["normal"], axis=-1, keepdims=True), 1e-6)
+        return Layers(color, direct, normal, layer["position"], layer["part"])
 
-    def figure_1(self) -> dict[str, np.ndarray]:
-        """A bust whose BRDF moves along a curve in the plane of Fresnel reflectance and roughness."""
-        made, color = self.scene("bust"), RECIPES["bust"].free[0][0]
+    def mitsuba(self, made: Made, changed: Look | None = None, **options: Any) -> Exact | None:
+        """Mitsuba's picture; None where it is not asked for."""
+        if not self.compare:
+            return None
+        return Exact(*(traced(made, changed, samples=self.samples, seed=seed, **options) for seed in (0, 1)))
+
+    def figure_1(self) -> Sheet:
+        """A bust whose BRDF moves along a curve in the plane of Fresnel reflectance and roughness.
+
+        Above the pictures, below what the bust sends to floor and walls: the difference from a black bust.
+        """
+        made = self.scene("bust")
+        light, camera = self.lamp(made), self.camera(made)
         curve = [(0.05, 0.8), (0.2, 0.4), (0.6, 0.2), (1.0, 0.1)]
-        shares = [(1.5, 0.3), (1.0, 0.5), (0.5, 0.7), (0.1, 0.85)]
-        return {
-            f"F0 {f0:g}, m {m:g}": self.drawn(made, {0: (base * np.asarray(color), gloss, [f0, m])})
-            for (f0, m), (base, gloss) in zip(curve, shares, strict=True)
-        }
+        shares = [(1.0, 0.3), (0.6, 0.5), (0.25, 0.8), (0.02, 1.0)]
+        pictures, sent, lines = {}, {}, []
+        black = self.layers(made, {0: (0.0, 0.0, [0.5, 0.5])}, light=light, camera=camera)
+        walls = black.region(1, 2, 3)
+        for (f0, m), (diffuse, specular) in zip(curve, shares, strict=True):
+            look = (diffuse * _RUST, specular * _GOLD, [f0, m])
+            color = self.layers(made, {0: look}, light=light, camera=camera).color
+            pictures[f"F0 {f0:g}, m {m:g}"] = _beside(color, self.ball(look, light, camera))
+            reached = np.where(walls[..., None], color[..., :3] - black.color[..., :3], 0)
+            first = next(iter(sent.values()))[..., :3] / _STRONGER if sent else reached
+            size = np.linalg.norm(black.color[walls][:, :3])
+            line = {
+                "f0": f0,
+                "m": m,
+                "sent": float(np.linalg.norm(reached[walls]) / size),
+                "changed": float(np.linalg.norm((reached - first)[walls]) / np.linalg.norm(first[walls])),
+                "red_over_blue": float(reached[walls][:, 0].sum() / reached[walls][:, 2].sum()),
+            }
+            lines.append(line)
+            caption = f"what it sends, {_STRONGER} times, for m {m:g}\n{share(line['sent'])} of the walls' light"
+            sent[caption] = np.concatenate([_STRONGER * np.maximum(reached, 0), black.color[..., 3:]], -1)
+        return Sheet({**pictures, **sent}, lines, next(iter(pictures.values())))
 
-    def figure_8(self) -> dict[str, np.ndarray]:
-        """One bounce off a ring, by the resolution of the light."""
-        found = {}
+    def ball(self, look: tuple, light: Environment, camera: Camera) -> np.ndarray:
+        """An exact picture of a ball of a material without shadows, a quarter as large as other pictures."""
+        rings = 8 if self.quick else 48
+        mesh = builtin.sphere(rings=rings, sectors=2 * rings)
+        away = np.asarray(camera.eye) - np.asarray(camera.target)
+        eye, edge = 4.5 * away / np.linalg.norm(away), self.edge // 4
+        view = Camera(eye, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 0.5, edge, edge)
+        facing = np.flatnonzero(np.sum(np.asarray(mesh.normal) * (eye - np.asarray(mesh.position)), 1) > 0)
+        radiance = drawing.unshadowed(mesh, paper_scenes.model("CT", look), light, eye, facing)
+        color = jnp.zeros((len(mesh.position), 4)).at[facing, :3].set(radiance).at[:, 3].set(1)
+        return np.asarray(image.render(mesh, color, view, background=None))
+
+    def figure_8(self) -> Sheet:
+        """One bounce off a ring, by the resolution of the light that is reflected.
+
+        All come from one tensor: light of few texels is the same radiance in the texels of each of its larger ones.
+        """
+        made, pictures, lines = self.scene("ring"), {}, []
+        light, camera = paper_scenes.light_of(made), self.camera(made)
+        assert made.scene.bounces is not None
+        once = eqx.tree_at(lambda relit: relit.bounces.tensor.second, made.scene, None, is_leaf=lambda x: x is None)
+        made, exact, inside = made._replace(scene=once), None, None
+        if self.compare:
+            whole, direct = (self.mitsuba(made, camera=camera, bounces=n) for n in (1, 0))
+            assert whole is not None
+            assert direct is not None
+            exact = Exact(*(_less(*pair) for pair in zip(whole, direct, strict=True)))
         for edge in (2, 4) if self.quick else (4, 8, 16):
-            # The directory of the finest has two bounces; these are one bounce each.
-            made = self.scene("ring", edge=edge, bounces=1)
-            whole, direct = self.drawn(made), self.drawn(made, scene=made.scene.without_bounces())
-            reflected = np.maximum(whole - direct, 0)
-            found[f"6 x {edge} x {edge}"] = np.concatenate([reflected[..., :3], whole[..., 3:]], -1)
-        return found
+            drawn = self.layers(made, light=blocks(light, edge), camera=camera)
+            picture, inside = _less(drawn.color, drawn.direct), self.inside(drawn)
+            line = {"light": f"6 x {edge} x {edge}", "mean": mean(picture, inside), "peak": _peak(picture, inside)}
+            caption = f"{line['light']}\nmean {line['mean']:.3f}, peak {line['peak']:.2f}"
+            if exact is not None:
+                line["error"] = exact.off(picture, inside)
+                caption += f", {share(line['error'])} off"
+            pictures[caption] = picture
+            lines.append(line)
+        if exact is not None and inside is not None:
+            picture = exact.picture
+            line = {"light": "Mitsuba 3", "mean": mean(picture, inside), "peak": _peak(picture, inside)}
+            lines.append(line)
+            pictures[f"Mitsuba 3, one bounce\nmean {line['mean']:.3f}, peak {line['peak']:.2f}"] = picture
+        return Sheet(pictures, lines)
 
-    def figure_11(self) -> dict[str, np.ndarray]:
-        """Direct light, and interreflection; `traced` has the first picture of the paper's."""
+    def inside(self, drawn: Layers) -> np.ndarray:
+        """Pixels of the table inside of the ring."""
+        return drawn.region(1) & (np.linalg.norm(drawn.position[..., [0, 2]], axis=-1) < interiors.INSIDE)
+
+    def figure_11(self) -> Sheet:
+        """A ray tracer, direct light, and interreflection; measured where the bird looks down at the blue ground."""
         made = self.scene("bird")
-        return {"direct light": self.drawn(made, scene=made.scene.without_bounces()), "two bounces": self.drawn(made)}
+        eye, target, angle = BELOW
+        recipe = made.recipe._replace(camera=(eye, target, angle))
+        camera = paper_scenes.camera_of(recipe, made.scene.mesh, edge=self.edge)
+        light = self.lamp(made)
+        drawn = self.layers(made, BIRD, light=light, camera=camera)
+        chest = drawn.region(0, toward=(0, -1, 0))
+        pictures, lines = {}, []
+        exact = self.mitsuba(made, BIRD, light=light, camera=camera)
+        named = {"direct light": drawn.direct, "two bounces": drawn.color}
+        if exact is not None:
+            named = {"Mitsuba 3, two bounces": exact.picture, **named}
+        for name, picture in named.items():
+            red, _, blue = np.mean(picture[chest][:, :3], 0)
+            line = {"picture": name, "chest": mean(picture, chest), "blue_over_red": float(blue / red)}
+            caption = f"{name}\nchest: {line['chest']:.3f}, blue {line['blue_over_red']:.2f} of red"
+            if exact is not None and not name.startswith("Mitsuba"):
+                line |= {"error": exact.off(picture, chest), "error_whole": exact.off(picture)}
+                caption += f", {share(line['error'])} off"
+            pictures[caption] = picture
+            lines.append(line)
+        return Sheet(pictures, lines)
 
-    def figure_12(self) -> dict[str, np.ndarray]:
+    def figure_12(self) -> Sheet:
         """A room: direct light, with bounces, and after adjusting floor, sofa and walls."""
         made = self.scene("room")
         shiny = {0: ([0.1, 0.1, 0.12], 0.6, 200.0)}
         green = {1: ([0.1, 0.45, 0.12], 0.1, 20.0), 0: ([0.5, 0.12, 0.08], 0.2, 60.0)}
         walls = {2: ([0.15, 0.3, 0.6], 0.05, 6.0)}
-        return {
-            "direct light": self.drawn(made, scene=made.scene.without_bounces()),
-            "two bounces": self.drawn(made),
-            "shiny dark floor": self.drawn(made, shiny),
-            "red floor, green sofa": self.drawn(made, green),
-            "blue walls": self.drawn(made, walls),
-            "light turned": self.drawn(made, lit=-0.5),
+        turned = paper_scenes.turned(paper_scenes.light_of(made), -0.5)
+        first = self.layers(made)
+        pictures = {
+            "direct light": first.direct,
+            "two bounces": first.color,
+            "shiny dark floor": self.layers(made, shiny).color,
+            "red floor, green sofa": self.layers(made, green).color,
+            "blue walls": self.layers(made, walls).color,
+            "light turned": self.layers(made, light=turned).color,
         }
+        fixed = first.region(3, 4, 5, 6, 7, 8, 9)  # parts whose materials stay
+        lines = [{"picture": name, "changed": off(picture, first.color, fixed)} for name, picture in pictures.items()]
+        return Sheet(pictures, lines)
 
-    def figure_13(self) -> dict[str, np.ndarray]:
+    def figure_13(self) -> Sheet:
         """Shininess of a base, above, and of what stands on it, below."""
         made = self.scene("airplane")
         (color, gloss, _), (ground, base, _) = (RECIPES["airplane"].free[number] for number in (0, 1))
-        found = {f"base, exponent {n:g}": self.drawn(made, {1: (ground, base, n)}) for n in (6.0, 60.0, 200.0)}
-        for n in (6.0, 60.0, 200.0):
-            found[f"object, exponent {n:g}"] = self.drawn(made, {0: (color, gloss, n)})
-        return found
+        pictures, lines = {}, []
+        for part, name, other in ((1, "base", 0), (0, "object", 1)):
+            first = None
+            for n in (6.0, 60.0, 200.0):
+                look = {1: (ground, base, n)} if part else {0: (color, gloss, n)}
+                drawn = self.layers(made, look, rays=_RAYS)
+                first = drawn.color if first is None else first
+                changed = off(drawn.color, first, drawn.region(other))
+                lines.append({"part": name, "exponent": n, "changed": changed})
+                pictures[f"{name}, exponent {n:g}\nthe other part: {share(changed)} changed"] = drawn.color
+        return Sheet(pictures, lines)
 
-    def ring(self) -> dict[str, np.ndarray]:
-        """Shininess of the ring, with its bounces: direct light and both bounces."""
+    def ring(self) -> Sheet:
+        """The caustic of Figure 13: exponents of a ring, with direct light and both bounces."""
         made = self.scene("ring")
-        color = RECIPES["ring"].free[0][1]
-        exponents = (20.0, 60.0, 200.0)
-        return {f"exponent {n:g}": self.drawn(made, {0: (0.02, color, n)}) for n in exponents}
+        color, camera = RECIPES["ring"].free[0][1], self.camera(made)
+        ours, theirs, lines = {}, {}, []
+        for n in (20.0, 60.0, 200.0):
+            look = {0: (0.02, color, n)}
+            drawn = self.layers(made, look, rays=_RAYS)
+            inside, wall = self.inside(drawn), drawn.region(0)
+            line = {"exponent": n, "peak": _peak(drawn.color, inside), "inside": mean(drawn.color, inside)}
+            caption = f"exponent {n:g}"
+            exact = self.mitsuba(made, look, camera=camera)
+            if exact is not None:
+                line |= {"error_inside": exact.off(drawn.color, inside), "error_wall": exact.off(drawn.color, wall)}
+                line["error_whole"] = exact.off(drawn.color)
+                caption += f"\ninside {share(line['error_inside'])} off, wall {share(line['error_wall'])}"
+                theirs[f"exponent {n:g}, Mitsuba 3"] = exact.picture
+            ours[caption] = drawn.color
+            lines.append(line)
+        return Sheet({**ours, **theirs}, lines)
 
-    def figure_15(self) -> dict[str, np.ndarray]:
-        """Chess with the light behind the board: direct light, and with bounces; then another view and material."""
+    def figure_14(self) -> Sheet:
+        """A watch of four metals, above; below, what it sends to the table: the difference from a black watch."""
+        made = self.scene("watch")
+        light, camera = self.lamp(made), self.camera(made)
+        pictures, glow, lines = {}, {}, []
+        black = self.layers(made, _watch(0.0, 0.0, 0.2), light=light, camera=camera)
+        table = black.region(3) & (np.abs(black.position[..., 0]) < 1.6) & (np.abs(black.position[..., 2]) < 2.2)
+        for name, (case, bracelet, m) in METALS.items():
+            color = self.layers(made, _watch(case, bracelet, m), light=light, camera=camera, rays=_RAYS).color
+            sent = np.where(black.region(3)[..., None], color[..., :3] - black.color[..., :3], 0)
+            line = {"metal": name, "m": m, "sent": float(sent[table].sum() / black.color[table][:, :3].sum())}
+            line["color"] = [float(value) for value in sent[table].sum(0) / sent[table].sum(0).max()]
+            pictures[f"{name}, m {m:g}"] = color
+            caption = f"what it sends, {_STRONGER} times, for {name}\n{share(line['sent'])} of the table's light"
+            glow[caption] = np.concatenate([_STRONGER * np.maximum(sent, 0), color[..., 3:]], -1)
+            lines.append(line)
+        return Sheet({**pictures, **glow}, lines, 1.5 * next(iter(pictures.values())))
+
+    def figure_15(self) -> Sheet:
+        """Chess with the light behind the board: direct light, and with bounces; measured where pieces look away."""
         made = self.scene("chess")
-        gold = {0: ([0.02, 0.02, 0.02], [1.0, 0.76, 0.33], [0.8, 0.2])}
-        return {
-            "direct light": self.drawn(made, scene=made.scene.without_bounces()),
-            "two bounces": self.drawn(made),
-            "another view": self.drawn(made, turn=0.5),
-            "one side of gold": self.drawn(made, gold),
-        }
+        light, camera = self.lamp(made), self.camera(made)
+        drawn = self.layers(made, light=light, camera=camera)
+        away = drawn.region(0, 1, toward=-np.asarray(LAMPS["chess"][0]))
+        exact = self.mitsuba(made, light=light, camera=camera)
+        pictures, lines = {}, []
+        named = {"direct light": drawn.direct, "two bounces": drawn.color}
+        if exact is not None:
+            named |= {"Mitsuba 3, two bounces": exact.picture}
+        for name, picture in named.items():
+            line = {"picture": name, "away": mean(picture, away)}
+            line["brighter"] = line["away"] / mean(drawn.direct, away)
+            caption = f"{name}\nsides away from the light: {line['away']:.4f}"
+            if picture is not drawn.direct:
+                caption += f", {line['brighter']:.1f} times"
+            if exact is not None and not name.startswith("Mitsuba"):
+                line |= {"error": exact.off(picture, away), "error_whole": exact.off(picture)}
+                caption += f", {share(line['error'])} off"
+            pictures[caption] = picture
+            lines.append(line)
+        return Sheet(pictures, lines)
 
 
-FIGURES: dict[str, Callable[[Figures], dict[str, np.ndarray]]] = {
+FIGURES: dict[str, Callable[[Figures], Sheet]] = {
     "1": Figures.figure_1,
     "8": Figures.figure_8,
     "11": Figures.figure_11,
     "12": Figures.figure_12,
     "13": Figures.figure_13,
     "ring": Figures.ring,
+    "14": Figures.figure_14,
     "15": Figures.figure_15,
 }
 
 
-def exposed(pictures: dict[str, np.ndarray], *, brighter: float = 0.0) -> dict[str, np.ndarray]:
-    """The pictures of a figure for the screen, on white, all with the exposure that the last one asks for."""
+def exposed(
+    pictures: Mapping[str, np.ndarray], *, like: np.ndarray | None = None, brighter: float = 0.0
+) -> dict[str, np.ndarray]:
+    """The pictures of a figure for the screen, on white, all with the exposure of the last one, or of `like`."""
     *_, last = pictures.values()
-    stops = float(image.automatic_exposure(jnp.asarray(last[..., :3]))) + brighter
-    return {title: _on_white(each, stops) for title, each in pictures.items()}
+    color = jnp.maximum(jnp.asarray((last if like is None else like)[..., :3]), 0)
+    stops = float(image.automatic_exposure(color)) + brighter
+    return {title: _on_white(picture, stops) for title, picture in pictures.items()}
 
 
 def _on_white(picture: np.ndarray, stops: float) -> np.ndarray:
     """A picture with coverage, clamped for the screen before it is laid over white, so that edges stay smooth."""
     cover = picture[..., 3:]
-    color = image.expose(jnp.asarray(picture[..., :3] / np.maximum(cover, 1e-6)), stops=stops)
+    color = image.expose(jnp.maximum(jnp.asarray(picture[..., :3] / np.maximum(cover, 1e-6)), 0), stops=stops)
     return np.asarray(image.display(jnp.asarray(cover) * jnp.clip(color, 0, 1) + 1 - cover))
 
 
-def main(options: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    parser.add_argument("folder", type=pathlib.Path, help="where to write the pictures")
-    parser.add_argument("--store", type=pathlib.Path, metavar="FOLDER", help="keep what is precomputed, and go on")
-    parser.add_argument("--only", nargs="+", choices=list(FIGURES), metavar="FIGURE", help=", ".join(FIGURES))
-    parser.add_argument("--quick", action="store_true", help="small pictures of small scenes")
-    arguments = parser.parse_args(options)
-    figures = Figures(quick=arguments.quick, store=arguments.store)
-    arguments.folder.mkdir(parents=True, exist_ok=True)
-    for name in arguments.only or FIGURES:
-        row = np.concatenate(list(exposed(FIGURES[name](figures)).values()), 1)
-        files.write_png(arguments.folder / f"figure_{name}.png", row.astype(np.float32))
-        print(f"figure {name}", flush=True)
+def blocks(light: Environment, edge: int) -> Environment:
+    """Light of as many texels whose radiance is that of 6 x edge x edge texels: means over solid angle."""
+    size = light.radiance.shape[-2]
+    wide = size // edge
+    return Environment(jnp.repeat(jnp.repeat(cubemap.reduced(light.radiance, size=edge), wide, 1), wide, 2))
 
 
-if __name__ == "__main__":
-    main()
+def _less(whole: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """A picture less another one of the same coverage; negative values, which are noise, stay."""
+    return np.concatenate([whole[..., :3] - part[..., :3], whole[..., 3:]], -1)
+
+
+def _beside(picture: np.ndarray, ball: np.ndarray) -> np.ndarray:
+    """A picture with a small one over its lower right corner."""
+    result, cover = picture.copy(), ball[..., 3:]
+    corner = result[-len(ball) :, -ball.shape[1] :]
+    corner[:] = ball + (1 - cover) * corner
+    return result
+
+
+def _peak(picture: np.ndarray, where: np.ndarray) -> float:
+    """The radiance that a thousandth of some pixels exceeds, over the colors."""
+    return float(np.quantile(np.mean(picture[where][:, :3], 1), 0.999))
+
+
+def _watch(case: Any, bracelet: Any, m: float) -> Look:
+    """Case and bracelet of two colors of metal."""
+    return {0: (0.0, case, [0.9, m]), 1: (0.0, bracelet, [0.9, m])}

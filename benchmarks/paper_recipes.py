@@ -136,7 +136,7 @@ RECIPES = {
         "daylight",
         ([0.1, 0.66, 0.56], _ABOVE, 0.6),
         None,
-        {"direct": 64, "edge": 16, "modes": 96},
+        {"direct": 64, "edge": 16, "modes": 96, "terms": 48},
     ),
     "chess": Recipe(
         lambda quick: (
@@ -150,7 +150,7 @@ RECIPES = {
         CHESS,
     ),
     "bust": Recipe(
-        lambda quick: interiors.corner(_scan("nefertiti.ply", 50_000, quick, "xzY"), cells=4 if quick else 79),
+        lambda quick: interiors.corner(_scan("nefertiti.ply", 16_000, quick, "xzY"), cells=4 if quick else 48),
         "CT",
         {0: ([0.25, 0.18, 0.1], 0.7, [0.5, 0.2])},
         {1: 0.6, 2: 0.6, 3: 0.6},
@@ -177,12 +177,12 @@ RECIPES = {
         AIRPLANE,
     ),
     "watch": Recipe(
-        lambda quick: _grounded(_scan("happy_buddha_100k.ply", 100_000, quick), quick, 12_100),
+        lambda quick: interiors.watch(step=0.5 if quick else 0.07),
         "CT",
-        {0: (0.02, [0.95, 0.75, 0.4], [0.8, 0.2]), 1: (0.3, 0.5, [0.1, 0.4])},
-        {},
+        {0: (0.02, [0.8, 0.8, 0.82], [0.9, 0.2]), 1: (0.02, [0.8, 0.8, 0.82], [0.9, 0.25])},
+        {2: [0.04, 0.06, 0.2], 3: 0.6},
         "grace_cross.hdr",
-        ([0.25, 0.35, 0.95], _ABOVE, 0.6),
+        ([0.12, 0.22, 0.6], [0.0, 0.02, 0.03], 0.55),
         WATCH,
     ),
 }

@@ -21,6 +21,7 @@ columns V, V&B and V,B&L, and for `precompute` the sum of its columns Precomp an
 `error` is what the tensor of the first bounce leaves out of what arrives, rms over clusters.
 """
 
+import dataclasses
 import itertools
 import json
 import pathlib
@@ -39,7 +40,8 @@ import numpy as np
 import jaxprt as prt
 from benchmarks import harness
 from benchmarks.paper_recipes import RECIPES, Look, Published, Recipe
-from jaxprt import bounces
+from benchmarks.published.lobes import BrdfSet
+from jaxprt import bounces, separable
 from jaxprt.brdf import BlinnPhong, CookTorrance
 from jaxprt.image import render
 from jaxprt.relit import Dynamic, paths
@@ -47,9 +49,12 @@ from jaxprt.relit.groups import joined_mesh
 from jaxprt.scene import Camera, Environment, Mesh, TexturedMaterial, builtin, load_environment
 from jaxprt.scene.environment import rotate
 from jaxprt.scene.mesh import bounds, split
+from jaxprt.systems import standard
+from jaxprt.systems.bounces.functions import FunctionWeights
 
 EDGE = 512  # pixels
 KINDS = ("view", "material", "light")  # of frames
+EXPONENTS, _FINE = (200.0, 60.0, 20.0), 40  # of sharp light paths, from the sharpest; edge of their maps in texels
 SIZE, BOUNCES = 32, 2  # edge of the light's faces for direct light, and number of bounces
 
 
@@ -151,16 +156,46 @@ def matte(albedo: Any) -> TexturedMaterial:
     return TexturedMaterial(base_color=albedo, metallic=0.0, roughness=1.0, specular=0.0)
 
 
-def with_transfer(scene: prt.RelitScene, path: pathlib.Path | None = None, **options: Any) -> prt.RelitScene:
-    """The scene with reflected light that is precomputed with other options, and a region for each part."""
+def with_transfer(
+    scene: prt.RelitScene, path: pathlib.Path | None = None, *, terms: int | None = None, **options: Any
+) -> prt.RelitScene:
+    """The scene with reflected light that is precomputed with other options, and a region for each part.
+
+    With `terms`, light paths off parts of Blinn-Phong have as many terms, and lobes of `EXPONENTS` as they are.
+    """
     assert scene.bounces is not None
-    lights = [paths.factor(scene.shading[parts[0]]) for parts in scene.place.parts]
+    shadings = [scene.shading[parts[0]] for parts in scene.place.parts]
+    lights = [
+        sharp_path(terms) if terms is not None and shading.table == standard.BLINN_PHONG else paths.factor(shading)
+        for shading in shadings
+    ]
     weights = [paths.typical(part, lights[n]) for part, n in zip(scene.shading, scene.place.group, strict=True)]
     brdfs, mesh = [lights[number].brdf for number in scene.place.group], joined_mesh(scene.shading)
     tensor = bounces.precompute(mesh, brdfs, weights=weights, run=prt.Run(path, progress=False), **options)
     vertices = [scene.place.vertices(number) for number in range(len(lights))]
-    made = bounces.GroupBounces.make(tensor, scene.bounces.group, vertices)
+    groups = [
+        dataclasses.replace(group, sent=light.sent) for group, light in zip(scene.bounces.group, lights, strict=True)
+    ]
+    made = bounces.GroupBounces.make(tensor, groups, vertices)
     return eqx.tree_at(lambda relit: relit.bounces, scene, made)
+
+
+def sharp_path(terms: int) -> paths.Path:
+    """Light paths of Blinn-Phong's lobes that are not smoothed over outgoing directions, so that caustics are sharp.
+
+    Functions are the lobes of `EXPONENTS` and a diffuse one. Between exponents the weights are interpolated.
+    """
+    lobes = BrdfSet.of([BlinnPhong(0.0, 1.0, exponent) for exponent in EXPONENTS])
+    factored = separable.factor(lobes, terms=terms, resolution=_FINE)
+    light = jnp.concatenate([factored.light_map, jnp.ones_like(factored.light_map[:1])])
+    view = jnp.pad(factored.view_map, ((0, 1), (0, 0), (0, 0), (0, 1))).at[-1, ..., -1].set(1 / np.pi)
+    brdf = separable.SeparableBrdf(light, view, factored.error, factored.coordinates)
+    exact = np.append(paths.channels(lobes), 1.0)
+    scale = exact / np.asarray(bounces.functions.albedo(brdf))
+    weight = np.zeros((len(EXPONENTS), 2, len(scale)), np.float32)  # of the diffuse channel and of the lobe
+    weight[:, 0, -1], weight[:, 1, :-1] = scale[-1], np.diag(scale[:-1])
+    knot = -np.log((np.asarray(EXPONENTS) + 2) / 2) / 2  # the logarithm of the roughness of the standard table
+    return paths.Path(brdf, FunctionWeights((jnp.asarray(knot, jnp.float32),), jnp.asarray(weight)))
 
 
 def _spent(path: pathlib.Path | None, seconds: float) -> tuple[float, int]:

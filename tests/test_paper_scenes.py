@@ -5,6 +5,8 @@ import pytest
 
 from benchmarks import paper_figures, paper_scenes
 from jaxprt import image
+from jaxprt.scene import builtin
+from jaxprt.sphere import cubemap
 
 
 @pytest.mark.parametrize("name", paper_scenes.RECIPES)
@@ -35,6 +37,39 @@ def test_the_background_does_not_count_in_what_a_picture_is_off():
     mine[:2, :2, :3] = 0.6
     expected = np.sqrt(2 * 0.01 / (8 * 0.25))
     assert paper_figures.off(mine, exact) == pytest.approx(expected)
+
+
+def test_noise_of_the_exact_picture_is_no_error():
+    rng = np.random.default_rng(0)
+    truth, one, other = np.full((200, 200, 4), 0.5), *rng.normal(0.5, 0.2, (2, 200, 200, 4))
+    mine = truth + [0.05, 0.05, 0.05, 0]
+    for picture in (truth, one, other, mine):
+        picture[..., 3] = 1
+    exact = paper_figures.Exact(one, other)
+    assert exact.off(mine) == pytest.approx(0.1, abs=0.01)
+    assert exact.off(truth) < 0.02
+    assert paper_figures.off(truth, one) > 0.3
+    half = np.arange(200)[None] + np.zeros((200, 1)) < 100
+    mine[:, 100:, :3] += 0.2
+    assert exact.off(mine, half) == pytest.approx(0.1, abs=0.01)
+
+
+def test_a_white_surface_that_faces_the_lamp_has_a_radiance_of_one_more_than_the_dim_light():
+    direction, size = np.array([0.3, 0.8, -0.5]), 64
+    light = paper_figures.soft_box(direction, 14, 0.2, size=size)
+    cosine = np.asarray(cubemap.direction(size=size)) @ (direction / np.linalg.norm(direction))
+    weight = np.maximum(cosine, 0) * np.asarray(cubemap.solid_angle(size=size))
+    irradiance = np.sum(weight[..., None] * np.asarray(light.radiance), (0, 1, 2))
+    np.testing.assert_allclose(irradiance / np.pi, 1.2, rtol=0.01)
+
+
+def test_light_in_blocks_has_the_flux_of_the_light_and_few_values():
+    light = builtin.studio(size=16)
+    coarse = paper_figures.blocks(light, 4)
+    area = np.asarray(cubemap.solid_angle(size=16))[..., None]
+    flux = [np.sum(area * np.asarray(each.radiance), (0, 1, 2)) for each in (light, coarse)]
+    np.testing.assert_allclose(flux[1], flux[0], rtol=1e-5)
+    assert len(np.unique(np.asarray(coarse.radiance)[..., 0])) <= 6 * 4 * 4
 
 
 def test_pictures_fade_into_white_at_edges_also_where_they_are_brighter_than_the_screen():

@@ -4,10 +4,12 @@ import argparse
 import pathlib
 from collections.abc import Sequence
 
-from benchmarks.figures import kautz2002, pages, sun2007, wang2004
+from benchmarks.figures import kautz2002, pages, sun2007, sun2007_scenes, wang2004
 from benchmarks.figures.run import Run, record
 
 FIGURES = {
+    **sun2007_scenes.FIGURES,
+    "sun2007_figure_4": sun2007.figure_4,
     "sun2007_figure_5": sun2007.figure_5,
     "sun2007_figure_6": sun2007.figure_6,
     "sun2007_figure_7": sun2007.figure_7,

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+import jaxprt as prt
 from benchmarks import harness, relight_harmonic
 from benchmarks.figures import drawing
 from benchmarks.figures.run import LIGHTS, Clock, Run
@@ -252,8 +253,25 @@ def table_1(run: Run) -> Iterator[dict[str, Any]]:
     """Frames of all rows of Table 1; meshes of the paper's sizes stand in where its own are not to be had."""
     edge = 16 if run.quick else 128
     table = harmonic.tabulate(relight_harmonic.BRDFS["glossy (12, 4)"], degree=DEGREE, resolution=edge)
-    light = harmonic.project(run.light("grace"), degree=DEGREE)
+    sky = run.light("grace")
+    light = harmonic.project(sky, degree=DEGREE)
     rows = relight_harmonic.meshes(run.quick)
     for name, mesh in rows.items():
-        lines = relight_harmonic.frame(name, mesh, table, light, 3 if run.quick else 15)
-        yield from ({"row": name, "vertices": len(mesh.position), **line} for line in lines)
+        wrong = table_errors(run, mesh, table, sky)
+        for line in relight_harmonic.frame(name, mesh, table, light, 3 if run.quick else 15):
+            shadows = "transfer" in line["case"].split(f", {name}")[0]
+            yield {"row": name, "vertices": len(mesh.position), **line, "radiance_error": wrong[shadows]}
+
+
+def table_errors(run: Run, mesh: Mesh, table: HarmonicBrdf, light: Environment) -> tuple[float, float]:
+    """Errors of the radiance that Table 1 times, at some vertices that face the eye: without shadows, and with them."""
+    brdf, view = relight_harmonic.BRDFS["glossy (12, 4)"], view_of(run, mesh, 0.6)
+    number = drawing.some(mesh, view.eye, 20 if run.quick else POINTS)
+    coefficient = harmonic.project(light, degree=DEGREE)
+    plain = unshadowed_radiance(mesh, table, coefficient, eye=view.eye)
+    exact = drawing.unshadowed(mesh, brdf, light, view.eye, number)
+    size = 8 if run.quick else 32
+    matrix = harmonic.precompute(mesh, degree=DEGREE, size=size, vertex=number, run=prt.Run(progress=False))
+    shadowed = prt.radiance(HarmonicSystem(matrix, table), coefficient, eye=jnp.asarray(view.eye))
+    truth = reference.radiance(mesh, brdf, light, eye=view.eye, vertex=number)
+    return measured(plain[number], exact)["error"], measured(shadowed, np.asarray(truth))["error"]

@@ -55,9 +55,9 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
 
 
-def percent(value: float, digits: int = 1) -> str:
-    """A share as percent."""
-    return f"{100 * value:.{digits}f} %"
+def percent(value: float | None, digits: int = 1) -> str:
+    """A share as percent; nothing where it was not measured."""
+    return "" if value is None else f"{100 * value:.{digits}f} %"
 
 
 def sun_5(lines: Lines) -> str:
@@ -94,7 +94,8 @@ def sun_6(lines: Lines) -> str:
     for name in dict.fromkeys(line["material"] for line in lines):
         mine = {line["lobes"]: line for line in lines if line["material"] == name}
         first = mine[kinds[0]]
-        rows.append([name, f"{first['m']:.3g}", f"{first['f0']:.3g}", *(percent(mine[k]["error"], 0) for k in kinds)])
+        cells = [f"{percent(mine[k]['error'], 0)} ({percent(mine[k]['left'], 0)})" for k in kinds]
+        rows.append([name, f"{first['m']:.3g}", f"{first['f0']:.3g}", *cells])
     return markdown(["material", "m", "F0", *kinds], rows)
 
 
@@ -127,12 +128,23 @@ def kautz_2(lines: Lines) -> str:
     return markdown(head, rows)
 
 
+_NUMBERS = {"norm": 2, "mean": 3, "peak": 2, "inside": 2, "chest": 3, "away": 4, "brighter": 1} | dict.fromkeys(
+    ("blue_over_red", "red_over_blue"), 2
+)  # digits of radiances and of their ratios
+
+
 def chosen(*columns: str) -> Callable[[Lines], str]:
     """A table of some keys: names as they are, errors and other shares as percent."""
 
     def cell(key: str, value: Any) -> str:
-        if key in ("error", "negative", "ground_error", "penumbra_error"):
+        if value is None:
+            return ""
+        if key in ("sent", "changed") or "error" in key or key == "negative":
             return percent(value)
+        if key in _NUMBERS:
+            return f"{value:.{_NUMBERS[key]}f}"
+        if key == "color":
+            return ", ".join(f"{part:.2f}" for part in value)
         if key.endswith("seconds"):
             return f"{value:.1f} s"
         if key == "share":
@@ -141,7 +153,7 @@ def chosen(*columns: str) -> Callable[[Lines], str]:
 
     def table(lines: Lines) -> str:
         heads = [key.replace("_", " ") for key in columns]
-        return markdown(heads, [[cell(key, line[key]) for key in columns] for line in lines])
+        return markdown(heads, [[cell(key, line.get(key)) for key in columns] for line in lines])
 
     return table
 
@@ -154,15 +166,17 @@ def kautz_table(lines: Lines) -> str:
         own = [line for line in lines if line["row"] == name and "fixed view, transfer" not in line["case"]]
         mine = {line["case"].split(",")[0]: line for line in own}
         paper = PAPER.get(name)
-        rows.append([name, f"{mine['general']['vertices']:,}", *(fps(mine[case]) for case in cases)])
+        errors = [percent(mine[case].get("radiance_error")) for case in ("general", "transfer")]
+        rows.append([name, f"{mine['general']['vertices']:,}", *(fps(mine[case]) for case in cases), *errors])
         if paper is not None:
-            rows.append(["in the paper", f"{paper.vertices:,}", *(f"{each:g}" for each in paper.frames)])
+            rows.append(["in the paper", f"{paper.vertices:,}", *(f"{each:g}" for each in paper.frames), "", ""])
     shading = {
         line["case"].split(",")[0]: line
         for line in lines
         if line["row"] == _SHADED and "fixed view, t" not in line["case"]
     }
-    table = markdown(["row", "vertices", "no transfer", "transfer", "fixed light", "fixed view"], rows)
+    head = ["row", "vertices", "no transfer", "transfer", "fixed light", "fixed view"]
+    table = markdown([*head, "error without transfer", "error with transfer"], rows)
     if len(shading) < len(cases):
         return table
     times = ", ".join(f"{1000 * shading[case]['seconds']:.2g}" for case in cases)
@@ -198,14 +212,46 @@ TABLES: dict[str, Callable[[Lines], str]] = {
     "wang2004_figure_4": wang_4,
     "wang2004_figure_4_bunny": chosen("brdf", "light", "terms", "error"),
     "wang2004_table_2": lambda lines: wang_table([dict(line) for line in lines]).strip(),
+    "sun2007_figure_1": chosen("f0", "m", "sent", "changed", "red_over_blue"),
+    "sun2007_figure_4": chosen("material", "component", "share", "norm"),
     "sun2007_figure_5": sun_5,
     "sun2007_figure_6": sun_6,
     "sun2007_figure_7": sun_7,
+    "sun2007_figure_8": chosen("light", "mean", "peak", "error"),
+    "sun2007_figure_11": chosen("picture", "chest", "blue_over_red", "error", "error_whole"),
+    "sun2007_figure_13": chosen("part", "exponent", "changed"),
+    "sun2007_caustic": chosen("exponent", "inside", "peak", "error_inside", "error_wall", "error_whole"),
+    "sun2007_figure_14": chosen("metal", "m", "sent", "color"),
+    "sun2007_figure_15": chosen("picture", "away", "brighter", "error", "error_whole"),
     "sun2007_principal": sun_principal,
 }
 
 # What the pictures of each figure show, for readers who do not see them.
 PICTURES: dict[str, dict[str, str]] = {
+    "sun2007_figure_1": {
+        "sun2007_figure_1.jpg": "A bust of four materials with balls of the same, and what it sends to the walls",
+    },
+    "sun2007_figure_4": {
+        "sun2007_figure_4.jpg": "A material, what its lobes leave, and its lobes of 0, 7, 14 and 21 degrees",
+    },
+    "sun2007_figure_8": {
+        "sun2007_figure_8.jpg": "One bounce off a ring with light of three resolutions, and by Mitsuba",
+    },
+    "sun2007_figure_11": {
+        "sun2007_figure_11.jpg": "A bird on blue ground by Mitsuba, in direct light and with two bounces",
+    },
+    "sun2007_figure_13": {
+        "sun2007_figure_13.jpg": "A dragon on a base: three exponents of the base, and three of the dragon",
+    },
+    "sun2007_caustic": {
+        "sun2007_caustic.jpg": "A ring of three exponents with its caustic, and by Mitsuba",
+    },
+    "sun2007_figure_14": {
+        "sun2007_figure_14.jpg": "A watch of steel, gold, copper with steel, and black steel",
+    },
+    "sun2007_figure_15": {
+        "sun2007_figure_15.jpg": "Chess in direct light, with two bounces, and by Mitsuba",
+    },
     "sun2007_figure_5": {
         "sun2007_figure_5.png": "Squared error against the rank, in both norms",
     },

@@ -1,4 +1,4 @@
-"""Sun et al. 2007: Figures 5, 6 and 7, and the principal components of section 4.3.
+"""Sun et al. 2007: Figures 4 to 7, and the principal components of section 4.3.
 
 A tensor of a set of BRDFs is [BRDF, view, light]. Two norms tell what a decomposition of it leaves. The published one
 is Frobenius' norm of the samples on the orthographic disk. Ours is that of the light of natural spectrum which the
@@ -8,6 +8,7 @@ BRDFs reflect. Errors are squared and relative, as the paper prints them.
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +22,9 @@ from benchmarks.published.tensors import hooi
 from jaxprt import dynamic, image
 from jaxprt.brdf import navigation
 from jaxprt.decompose import tucker
-from jaxprt.scene import builtin, camera
+from jaxprt.scene import Environment, Mesh, builtin, camera
+from jaxprt.scene.environment import background
+from jaxprt.sphere import cubemap, directions
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.separable.factorization import tabulate
 
@@ -29,6 +32,8 @@ SETS = (1, 2, 3, 4, 5, 6)  # n_h
 TERMS = (4, 8, 12, 16, 20, 24, 28, 32)  # n_wi = n_wo
 ANGLES = (0, 7, 14, 21)
 RESOLUTION = 24  # of maps, in texels
+SEPARATED = (0.02, 0.09)  # roughness of the materials of Figure 4
+ANGLE = np.radians(np.linspace(-89.5, 89.5, 359))
 MEMBERS = 20  # of the set of Figure 6, at equal steps of their order by roughness
 NODES = 16  # of tables of lobes over the view angle
 # What the paper prints: no lobes at the finest ranks, and five functions of the two sets.
@@ -46,6 +51,103 @@ def measured(run: Run) -> navigation.Family:
 def place_of(brdf: Any) -> tuple[float, float]:
     """Fresnel reflectance and roughness of one of the set."""
     return float(brdf.f0[0]), float(brdf.roughness)
+
+
+def figure_4(run: Run) -> Iterator[dict[str, Any]]:
+    """Two measured materials on a ball and in the plane of incidence: whole, without lobes, and lobes one by one."""
+    family, light = measured(run), run.light("grace", size=64)
+    edge, rings = (16, 8) if run.quick else (208, 80)
+    ball = builtin.sphere(rings=rings, sectors=2 * rings)
+    view = camera.orbit(ball, elevation=0.2, width=edge, height=edge)
+    rows, captions = [], []
+    for roughness in SEPARATED:
+        number = min(
+            range(len(family.brdf)), key=lambda index: abs(np.log(place_of(family.brdf[index])[1] / roughness))
+        )
+        brdf = family.brdf[number]
+        table = mirror_lobes(brdf, angles=ANGLES, resolution=8 if run.quick else NODES)
+        color = components(brdf, table, ball, light, np.asarray(view.eye))
+        values, titles, pictures = incidence(brdf, table), [], []
+        for name, radiance in color.items():
+            share, norm = (float(size(radiance) / size(color["original"])) for size in (np.sum, np.linalg.norm))
+            label = f"{family.name[number]}\nm = {place_of(brdf)[1]:.3g}" if name == "original" else name
+            titles.append(label if name == "original" else f"{label}\n{100 * share:.0f} % of the light")
+            drawn = image.render(ball, jnp.asarray(radiance), view)
+            pictures.append(np.asarray(drawn))
+            yield {"material": family.name[number], "component": name, "share": share, "norm": norm}
+        rows.append([drawing.shown(picture, like=pictures[0]) for picture in pictures])
+        rows.append([slice_of(values[name], values["original"], edge) for name in color])
+        captions += [titles, [""] * len(titles)]
+    drawing.sheet(run.picture("sun2007_figure_4.jpg"), rows, captions)
+
+
+def components(brdf: Any, table: LobeBrdf, ball: Mesh, light: Environment, eye: np.ndarray) -> dict[str, np.ndarray]:
+    """Radiance [v 3] of a ball without shadows: of a BRDF, of what lobes leave, and of its lobes; 0 where unseen."""
+    toward = directions.normalize(jnp.asarray(eye) - ball.position)
+    seen = np.flatnonzero(np.sum(np.asarray(ball.normal) * np.asarray(toward), 1) > 0)
+    axes = directions.frame(ball.normal, ball.tangent)[seen]
+    wo = jnp.einsum("vij,vj->vi", axes, toward[seen])
+    mirror = np.asarray(jnp.einsum("vij,vi->vj", axes, wo * jnp.array([-1, -1, 1])))
+    lobes = table.lookup(wo)
+    sent = {}
+    for index, angle in enumerate(ANGLES):
+        weight = np.asarray(lobes.weight[:, index]).T
+        sent[f"{angle}°"] = weight * blurred(light, mirror, float(lobes.concentration[index, 0]))
+    whole = np.broadcast_to(drawing.unshadowed(ball, brdf, light, eye, seen), (len(seen), 3))
+    parts = {"original": whole, "without lobes": whole - sum(sent.values()), **sent}
+    blank = np.zeros((len(ball.position), 3), np.float32)
+    result = {name: blank.copy() for name in parts}
+    for name, radiance in parts.items():
+        result[name][seen] = radiance
+    return result
+
+
+def blurred(light: Environment, direction: np.ndarray, concentration: float) -> np.ndarray:
+    """Means of the light, weighted by a lobe around each direction [v 3]; the light itself if texels are wider."""
+    size = light.radiance.shape[-2]
+    if concentration > size**2 * 4:
+        return np.asarray(background(light, jnp.asarray(direction)))
+    texel = np.asarray(cubemap.direction(size=size)).reshape(-1, 3)
+    radiance, area = np.asarray(light.radiance).reshape(-1, 3), np.asarray(cubemap.solid_angle(size=size)).ravel()
+    result = []
+    for block in np.array_split(direction, max(1, len(direction) // 512)):
+        weight = np.exp(concentration * (block @ texel.T - 1)) * area
+        result.append(weight @ radiance / weight.sum(1, keepdims=True))
+    return np.concatenate(result)
+
+
+def incidence(brdf: Any, table: LobeBrdf) -> dict[str, np.ndarray]:
+    """BRDF x cosine over `ANGLE` in the plane of incidence of a view at 45 degrees: whole, left by lobes, and lobes."""
+    wi = jnp.asarray(np.stack([np.sin(ANGLE), 0 * ANGLE, np.cos(ANGLE)], -1), jnp.float32)
+    wo = jnp.broadcast_to(jnp.asarray([-np.sqrt(0.5), 0, np.sqrt(0.5)], jnp.float32), wi.shape)
+    whole, lobes = np.asarray(brdf(wi, wo))[:, 0] * np.asarray(wi[:, 2]), table.lookup(wo)
+    sent = {}
+    for index, angle in enumerate(ANGLES):
+        alone = (jnp.arange(len(ANGLES)) == index)[:, None]
+        one = eqx.tree_at(lambda lobe: lobe.weight, lobes, lobes.weight * alone)
+        sent[f"{angle}°"] = np.asarray(one.evaluate(wi))[0]
+    return {"original": whole, "without lobes": whole - sum(sent.values()), **sent}
+
+
+def slice_of(value: np.ndarray, whole: np.ndarray, edge: int) -> np.ndarray:
+    """A polar plot over `ANGLE`: the square root as radius, so that wide lobes are seen; red where it is negative."""
+    from matplotlib import pyplot
+
+    figure = pyplot.figure(figsize=(edge / 100, 0.55 * edge / 100), dpi=100)
+    axis = figure.add_axes((0, 0, 1, 1))
+    most = np.sqrt(whole.max())
+    for part, color in ((whole, "0.8"), (np.maximum(value, 0), "C0"), (np.maximum(-value, 0), "C3")):
+        radius = np.sqrt(part) / most
+        axis.fill(np.sin(ANGLE) * radius, np.cos(ANGLE) * radius, color=color)
+    axis.plot([-1, 1], [0, 0], color="0.4", linewidth=1)
+    axis.plot([0, -0.7], [0, 0.7], color="0.4", linewidth=1, linestyle=":")
+    axis.set(xlim=(-0.85, 0.85), ylim=(-0.08, 0.86))
+    axis.set_aspect("equal")
+    axis.set_axis_off()
+    figure.canvas.draw()
+    drawn = np.asarray(figure.canvas.buffer_rgba())[..., :3] / 255.0  # pyright: ignore[reportAttributeAccessIssue]
+    pyplot.close(figure)
+    return drawn
 
 
 def figure_5(run: Run) -> Iterator[dict[str, Any]]:
@@ -231,6 +333,7 @@ def figure_6(run: Run) -> Iterator[dict[str, Any]]:
     for count in (1, 4) if run.quick else (1, 2, 3, 4):
         sets[" ".join(f"{k}°" for k in ANGLES[:count])] = separated(run, brdfs, ANGLES[:count])
     ranks = (2, 4, 4) if run.quick else (4, 8, 8)
+    left = {name: remaining([family.brdf[n] for n in chosen], name, run) for name in sets}
     made = {
         name: dynamic.tabulate(BrdfSet.of(brdfs), lobes=lobes, ranks=ranks, resolution=resolution)
         for name, lobes in sets.items()
@@ -248,11 +351,31 @@ def figure_6(run: Run) -> Iterator[dict[str, Any]]:
             row.append(np.asarray(image.render(ball, jnp.zeros((len(ball.position), 3)).at[number].set(color), view)))
             titles.append(f"{name}\nexact" if lobes == "exact" else f"{lobes}\n{100 * wrong:.0f} % off")
             if lobes != "exact":
-                more = dict(zip(("f0", "m"), place_of(family.brdf[material]), strict=True))
-                yield {"material": family.name[material], "lobes": lobes, "error": wrong, **more}
+                f0, m = place_of(family.brdf[material])
+                rest = float(left[lobes][chosen.index(material)])
+                yield {
+                    "material": family.name[material],
+                    "lobes": lobes,
+                    "error": wrong,
+                    "f0": f0,
+                    "m": m,
+                    "left": rest,
+                }
         rows.append([drawing.shown(each, like=row[0]) for each in row])
         captions.append(titles)
     drawing.sheet(run.picture("sun2007_figure_6.jpg"), rows, captions)
+
+
+def remaining(brdfs: Sequence, name: str, run: Run) -> np.ndarray:
+    """What lobes leave of each BRDF before the tensor: relative norm of what is reflected of natural light.
+
+    `name` has the angles of the lobes, as in "0° 7°", or none.
+    """
+    angles = tuple(angle for angle in ANGLES if f"{angle}°" in name.split())
+    table = separated(run, brdfs, angles) if angles else None
+    resolution = 8 if run.quick else RESOLUTION
+    rest, whole = (np.asarray(reflected(brdfs, t, resolution=resolution)[0], np.float64) for t in (table, None))
+    return np.sqrt(np.sum(rest**2, (1, 2)) / np.sum(whole**2, (1, 2)))
 
 
 def shininess(family: navigation.Family, count: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""Procedural scenes with strong interreflection: two sides of chess, a room, a corner, a ring on a table.
+"""Procedural scenes with strong interreflection: two sides of chess, a room, a corner, a ring and a watch on a table.
 
 Light is distant, so each scene is open somewhere. Three rules avoid artifacts of lighting that is computed at vertices.
 First, objects that stand on others leave a gap. Second, vertices lie just outside of the foot of an object, not below
@@ -10,6 +10,7 @@ Reference: Sun, Zhou, Chen, Lin, Shi, Guo 2007, section 5, shows such scenes.
 
 import itertools
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ import numpy as np
 
 from jaxprt.scene import builtin
 from jaxprt.scene.builtin import SurfacePatch, assemble, curve, patch, sweep
-from jaxprt.scene.mesh import Mesh, bounds, grid_face, join, split
+from jaxprt.scene.mesh import Mesh, bounds, grid_face, ground_plane, join, split
 
 _CELL = 0.1  # spacing of the room's vertices; floor and walls share vertices where they meet
 _GAP = 0.003  # gap between objects in the room and on the table, about 5e-4 of the diagonals
@@ -38,9 +39,18 @@ _NEAR, _FAR = 0.3, 0.9  # distances from the object to walls and to open edges, 
 _ABOVE = 0.4  # height of the walls above the object's top, relative to its longest side
 
 _RING = 0.93, 1.0, 0.5  # inner and outer radius, height
+INSIDE = _RING[0] - _CLEAR  # radius of the table's vertices inside of the ring
 _RING_SECTORS, _RING_STEP = 96, 0.042
 _TABLE = 2.4, 0.12  # radius and thickness
 _SHELLS = 24, 18  # circles of vertices inside of the ring and around it
+
+_CASE = [(0.98, 0.02), (0.98, 0.2), (0.86, 0.31), (0.8, 0.31), (0.77, 0.22)]  # (radius, height) of a watch's side
+_DIAL = 0.76, 0.22  # radius and height of the dial
+_HANDS = (0.42, 0.055, -0.9), (0.62, 0.035, 0.75)  # length, width, and angle from twelve o'clock
+_LOOP = 1.25, 1.5  # half axes of the bracelet, up and towards the viewer
+_LEAN = 0.95  # angle of the dial above the horizon, as seen from the middle of the bracelet
+_ROWS, _OPEN = 17, 0.72  # rows of links, and half of the arc that the case takes, both along the bracelet
+_LINKS = [(-0.5, -0.21), (-0.19, 0.19), (0.21, 0.5)]  # the ends of the links of a row
 
 _Sides = Sequence[tuple[int, int]]  # sides of a box: axis, and 0 for the lower end or 1 for the higher
 
@@ -136,6 +146,72 @@ def ring(*, spacing: float = 1.0) -> Mesh:
     side, slope = curve([(edge, -thickness), (edge, 0)], step=thickness, turn=1.0)
     table = [_disk(np.concatenate(radius)), sweep(side, slope, sectors=8 * (inside + around))]
     return join([assemble(_band(profile, round(_RING_SECTORS / spacing), _RING_STEP * spacing)), assemble(table)])
+
+
+def watch(*, step: float = 0.07) -> Mesh:
+    """A wristwatch whose closed bracelet stands on a table, with the dial towards the viewer and upward.
+
+    The case has a radius of 1. The bracelet has 17 rows of three links with gaps between them.
+
+    Args:
+        step: Spacing of the vertices of case and dial; that of links is 1.6 times as large.
+
+    Returns:
+        A mesh of 12,325 vertices in four regions: 0 the case with crown, hands and marks, 1 the bracelet, 2 the dial
+        and 3 the table. Other steps change the number of vertices.
+
+    Raises:
+        ValueError: The step is not from 0.03 to 0.5.
+    """
+    if not 0.03 <= step <= 0.5:
+        raise ValueError(f"step must be from 0.03 to 0.5, got {step}")
+    sectors, (radius, height) = round(2 * np.pi / step), _DIAL
+    corners = [(0.0, 0.02), *_CASE]
+    case = [sweep(*curve(list(ends), step=step, turn=1.0), sectors=sectors) for ends in itertools.pairwise(corners[1:])]
+    back = sweep(np.array(corners[:2]), np.array([[1.0, 0], [1, 0]]), sectors=sectors)
+    crown = _block((1.0, 0.04, -0.1), (1.16, 0.2, 0.1), 0.03, step=step)
+    mark = _block((-0.03, height + 0.005, -0.72), (0.03, height + 0.03, -0.58), 0.008, step=2 * step)
+    marks = [_turned_about_y(mark, hour) for hour in 2 * np.pi * np.arange(12) / 12]
+    hands = []
+    for (length, width, turn), low in zip(_HANDS, (height + 0.035, height + 0.06), strict=True):
+        hand = _block((-width, low, -length), (width, low + 0.02, 0.1), 0.008, step=step)
+        hands.append(_turned_about_y(hand, turn))
+    dial = _disk(np.linspace(0, radius, max(2, round(radius / step)) + 1))
+    dial = _moved(dial, (0.0, height, 0.0))
+    place = partial(_on_loop, angle=_LEAN)
+    links = []
+    for angle in _LEAN + np.linspace(_OPEN, 2 * np.pi - _OPEN, _ROWS):
+        long = 0.42 * _loop_speed(angle) * (2 * np.pi - 2 * _OPEN) / (_ROWS - 1)
+        for low, high in _LINKS:
+            links.append(_on_loop(_block((low, -0.07, -long), (high, 0.07, long), 0.035, step=1.6 * step), angle=angle))
+    parts = [assemble([place(part) for part in [*case, back, crown, *marks, *hands]]), assemble(links)]
+    whole = join([*parts, assemble([place(dial)])])
+    return join([whole, ground_plane(whole, vertices=round(18 / step**2), extent=2.6)])
+
+
+def _loop_speed(angle: float) -> float:
+    """Length along the bracelet for each radian of its parameter."""
+    up, forward = _LOOP
+    return float(np.hypot(up * np.cos(angle), forward * np.sin(angle)))
+
+
+def _on_loop(part: SurfacePatch, *, angle: float) -> SurfacePatch:
+    """A part on the bracelet: its y axis points outward, its z axis along the bracelet, downward in front."""
+    up, forward = _LOOP
+    place = np.array([0, up * np.sin(angle), forward * np.cos(angle)])
+    outward = np.array([0, np.sin(angle) / up, np.cos(angle) / forward])
+    outward /= np.linalg.norm(outward)
+    axes = np.stack([[1.0, 0, 0], outward, np.cross([1.0, 0, 0], outward)])
+    position, face, normal = part
+    return position @ axes + place, face, normal @ axes
+
+
+def _turned_about_y(part: SurfacePatch, angle: float) -> SurfacePatch:
+    """A part turned clockwise, as seen from above."""
+    position, face, normal = part
+    c, s = np.cos(angle), np.sin(angle)
+    rotation = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    return position @ rotation, face, normal @ rotation
 
 
 def _reveal() -> list[SurfacePatch]:

@@ -35,6 +35,7 @@ def make(name):
         "room": interiors.room,
         "corner": lambda: interiors.corner(pieces()),
         "ring": interiors.ring,
+        "watch": interiors.watch,
     }[name]()
 
 
@@ -92,6 +93,7 @@ def rays(name, *, count=64):
         ("sides", [6044, 4066, 3042, 3626]),
         ("room", [1481, 2568, 1182, 1204, 1176, 1806, 573, 688, 1300, 1474, 440, 472]),
         ("ring", [3072, 7897]),
+        ("watch", [2363, 5712, 529, 3721]),
     ],
 )
 def test_scenes_have_the_stated_vertices_and_regions(name, counts):
@@ -108,7 +110,8 @@ def test_frames_are_orthonormal(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "least"), [("sides", GROOVES), ("room", ROUNDED), ("corner", GROOVES), ("ring", SMOOTH)]
+    ("name", "least"),
+    [("sides", GROOVES), ("room", ROUNDED), ("corner", GROOVES), ("ring", SMOOTH), ("watch", ROUNDED)],
 )
 def test_winding_agrees_with_normals(name, least):
     mesh = make(name)
@@ -167,7 +170,7 @@ def test_the_sides_are_the_pieces_of_the_chess_scene_on_both_sides_of_the_diagon
 @pytest.mark.parametrize(
     ("name", "region", "bodies"),
     [
-        *[("sides", 0, 4), ("sides", 1, 3), ("ring", 0, 1)],
+        *[("sides", 0, 4), ("sides", 1, 3), ("ring", 0, 1), ("watch", 1, 51)],
         *[("room", region, bodies) for region, bodies in ((1, 6), (7, 5), (8, 3), (9, 1), (10, 1), (11, 2))],
     ],
 )
@@ -303,3 +306,19 @@ def test_a_coarser_ring_has_fewer_vertices_in_the_same_place():
         np.testing.assert_allclose(low, high, atol=0.05)  # Of polygons, whose corners lie elsewhere.
     with pytest.raises(ValueError, match=r"spacing must be from 0.25 to 4, got 9.0"):
         interiors.ring(spacing=9.0)
+
+
+def test_the_watch_stands_on_its_bracelet_with_the_dial_inside_of_the_case():
+    case, bracelet, dial, table = split(make("watch"))
+    assert float(bracelet.position[:, 1].min()) < float(case.position[:, 1].min())
+    assert float(table.position[:, 1].max()) < float(bracelet.position[:, 1].min())
+    normal = np.asarray(dial.normal[0], np.float64)
+    assert normal[1] > 0.5  # upward
+    assert normal[2] > 0.5  # and towards the viewer
+    middle = np.asarray(dial.position, np.float64).mean(0)
+    height = (np.asarray(case.position) - middle) @ normal
+    radius = np.linalg.norm(np.asarray(case.position) - middle - height[:, None] * normal, axis=1)
+    assert radius.max() < 1.2  # the crown
+    assert np.all((height > 0) | (radius > 0.76) | (height < -0.15))  # hands and marks above the dial, the back below
+    with pytest.raises(ValueError, match=r"step must be from 0.03 to 0.5, got 0.01"):
+        interiors.watch(step=0.01)
