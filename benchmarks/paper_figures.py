@@ -55,7 +55,7 @@ class Sheet(NamedTuple):
     Attributes:
         pictures: Pictures [h, w, 4] by their captions: linear radiance before black, and coverage.
         lines: What was measured.
-        like: The picture whose exposure all have; the last if None.
+        like: Radiance whose exposure all have; that of the last picture if None.
     """
 
     pictures: dict[str, np.ndarray]
@@ -271,7 +271,7 @@ class Figures:
             lines.append(line)
             caption = f"what it sends, {_STRONGER} times, for m {m:g}\n{share(line['sent'])} of the walls' light"
             sent[caption] = np.concatenate([_STRONGER * np.maximum(reached, 0), black.color[..., 3:]], -1)
-        return Sheet({**pictures, **sent}, lines, next(iter(pictures.values())))
+        return Sheet({**pictures, **sent}, lines, 2 * next(iter(pictures.values())))
 
     def ball(self, look: tuple, light: Environment, camera: Camera) -> np.ndarray:
         """An exact picture of a ball of a material without shadows, a quarter as large as other pictures."""

@@ -31,6 +31,7 @@ from jaxprt import harmonic, reference, scene, visibility
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.image import interpolate, rasterize
 from jaxprt.scene import Mesh, builtin, camera, load_mesh, subdivision
+from jaxprt.scene.mesh import make_mesh
 from jaxprt.sphere import directions, harmonics, rotation
 from jaxprt.systems.harmonic import TransferMatrix
 
@@ -100,6 +101,9 @@ def table_mesh(name: str) -> Mesh:
         rings = round((row.vertices / 2) ** 0.5)
         return builtin.sphere(rings=rings, sectors=2 * rings)
     mesh = load_mesh(path)
+    corner = np.asarray(mesh.position, np.float64)[np.asarray(mesh.face)]
+    if np.sum(np.cross(corner[:, 0], corner[:, 1]) * corner[:, 2]) < 0:  # the horse's file is inside out
+        mesh = make_mesh(mesh.position, np.asarray(mesh.face)[:, ::-1], name=row.file)
     return divided(mesh, row.vertices) if row.divided else mesh
 
 

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from benchmarks import paper_figures, paper_scenes
-from jaxprt import image
+from jaxprt import bounces, image
+from jaxprt.brdf import BlinnPhong
+from jaxprt.relit import paths
 from jaxprt.scene import builtin
 from jaxprt.sphere import cubemap
 
@@ -37,6 +39,18 @@ def test_the_background_does_not_count_in_what_a_picture_is_off():
     mine[:2, :2, :3] = 0.6
     expected = np.sqrt(2 * 0.01 / (8 * 0.25))
     assert paper_figures.off(mine, exact) == pytest.approx(expected)
+
+
+def test_sharp_light_paths_send_the_albedo_of_each_exponent(monkeypatch):
+    monkeypatch.setattr(paper_scenes, "_FINE", 12)
+    path = paper_scenes.sharp_path(8)
+    assert path.sent is not None
+    sent = np.asarray(path.sent.factor) @ np.asarray(bounces.functions.albedo(path.brdf))
+    exact = [paths.channels(BlinnPhong(0.0, 1.0, exponent))[0] for exponent in paper_scenes.EXPONENTS]
+    np.testing.assert_allclose(sent[:, 0], 1, rtol=1e-5)
+    np.testing.assert_allclose(sent[:, 1], exact, rtol=1e-3)
+    (knot,) = path.sent.knot
+    assert np.all(np.diff(knot) > 0)
 
 
 def test_noise_of_the_exact_picture_is_no_error():
