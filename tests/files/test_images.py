@@ -116,7 +116,9 @@ def test_what_is_no_image_is_refused_by_name(tmp_path):
     with pytest.raises(ValueError, match="got a directory"):
         read_image(tmp_path)
     (tmp_path / "text.hdr").write_text("not an image")
-    with pytest.raises(ValueError, match=r"text\.hdr must be an EXR, HDR, .* got one that starts with the text 'not an i'"):
+    with pytest.raises(
+        ValueError, match=r"text\.hdr must be an EXR, HDR, .* got one that starts with the text 'not an i'"
+    ):
         read_image(str(tmp_path / "text.hdr"))
     (tmp_path / "empty.exr").write_bytes(b"")
     with pytest.raises(ValueError, match=r"empty\.exr .* got an empty file"):

@@ -34,7 +34,9 @@ SHADES = """async ({ module, data, message, angle, radius, backs, size }) => {
   const bytes = Uint8Array.from(atob(data), (each) => each.charCodeAt(0));
   const { content, buffers } = unpack(bytes.buffer), canvas = document.createElement("canvas");
   Object.assign(canvas, size);
-  const gl = canvas.getContext("webgl2"), pixels = new Pixels(gl, new Piece(content, buffers), backs);
+  const gl = canvas.getContext("webgl2"), piece = new Piece(content, buffers);
+  await piece.expand();
+  const pixels = new Pixels(gl, piece, backs);
   const camera = new Camera({ eye: message.eye, target: message.target, radius, field_of_view: angle });
   const matrix = camera.matrix(size.width / size.height, [0, 0, 0]);
   pixels.change(message);
@@ -45,6 +47,26 @@ SHADES = """async ({ module, data, message, angle, radius, backs, size }) => {
   const error = gl.getError(), read = pixels.read();
   pixels.close();
   return { error, data: Array.from(read.data) };
+}"""
+
+
+# Expands visibility by a clock that stands still, and by one on which each step takes a second. `between` counts the
+# tasks of the page that ran meanwhile.
+EXPANDS = """async ({ module, data }) => {
+  const { Piece, unpack } = await import(module);
+  const { content, buffers } = unpack(Uint8Array.from(atob(data), (each) => each.charCodeAt(0)).buffer), result = [];
+  for (const step of [0, 1000]) {
+    const { port1, port2 } = new MessageChannel(), piece = new Piece(content, buffers);
+    let time = 0, between = 0;
+    performance.now = () => (time += step);
+    port1.onmessage = () => { between++; port2.postMessage(null); };
+    port2.postMessage(null);
+    const before = piece.pyramid.length;
+    await piece.expand();
+    port1.close();
+    result.push({ between, before, after: Array.from(piece.pyramid) });
+  }
+  return result;
 }"""
 
 
@@ -154,6 +176,22 @@ class Counted(Session):
         self.asked = getattr(self, "asked", Counter())
         self.asked[message.get("kind")] += 1
         return super().answer(message, buffers)
+
+
+def test_visibility_is_expanded_in_slices_between_which_the_page_goes_on(browser, systems, lights):
+    content, arrays = page_content(PageScene.for_gpu(systems["lobes"]), list(lights.values()))
+    mesh = systems["lobes"].mesh
+    places = np.asarray(mesh.position, "<f4").tobytes(), stages.counterclockwise(mesh).tobytes()
+    data = base64.b64encode(messages.pack(content, [*places, *arrays])).decode()
+    tab = browser.new_page()
+    module = "data:text/javascript;base64," + base64.b64encode(modules.module().encode()).decode()
+    still, sliced = tab.evaluate(EXPANDS, {"module": module, "data": data})
+    tab.close()
+    assert still["between"] == 0
+    assert sliced["between"] > 20
+    assert still["before"] < len(still["after"]) == len(sliced["after"])
+    assert still["after"] == sliced["after"]
+    assert 0 < np.mean(np.asarray(still["after"]) > 0) <= 1
 
 
 def test_light_view_and_material_change_without_python(browser, systems, lights):

@@ -26,6 +26,15 @@ export async function inflate(data, count, before, mask) {
   return result;
 }
 
+// Ends a task of the page, so that frames and events come between. Unlike timers it does not wait in hidden pages.
+export function pause() {
+  const { port1, port2 } = new MessageChannel();
+  return new Promise((resolve) => {
+    port1.onmessage = () => { port1.close(); resolve(); };
+    port2.postMessage(null);
+  });
+}
+
 export async function decompressed(data) {
   const stream = new Blob([data]).stream().pipeThrough(new DecompressionStream("deflate"));
   return new Uint8Array(await new Response(stream).arrayBuffer());

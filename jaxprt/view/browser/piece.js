@@ -2,11 +2,13 @@
 // Diffuse light by transfer vectors; glossy light by lobes and means of visibility, as the lobe system does, or by transfer
 // matrices, as the harmonic system does: harmonics of the visibility are kept, and a light is taken through them once.
 
+import { pause } from "./common.js";
 import { ARRIVE, GATHER, SHADE, SIGHT, WHOLE, WIDTH } from "./shading.js";
 import { gathered, harmonics } from "./harmonics.js";
 import { Blur, SIDES, grid, halved, readHdr, rimmed, toCubemap, toHalf, toSky, whole } from "./lights.js";
 
 const TEXTURES = ["base_color", "roughness", "metallic"]; // that are read at pixels
+const SLICE = 8; // milliseconds of computing, after which the page may draw a frame
 const FINE = 4; // parts along the edge of a texel by which the rim of a lamp is found
 
 export class Piece {
@@ -28,7 +30,11 @@ export class Piece {
     this.index = new Map(content.rims.map((edge) => [edge, next(Uint32Array)]));
     this.lights = Array.from({ length: content.lights }, () => next(Float32Array));
     this.count = this.position.length / 3;
-    if (content.means > this.pyramid.length) this.pyramid = means(content, this.bits, this.index);
+  }
+  // Means of visibility, where only bits were sent: to await before `build`.
+  async expand() {
+    const { content } = this;
+    if (content.means > this.pyramid.length) this.pyramid = await (this.expanding ??= means(content, this.bits, this.index));
   }
   build(gl) { // in a context, whose first texture unit stays free
     const { content } = this;
@@ -392,17 +398,21 @@ export class Piece {
 }
 
 // Means of visibility at all scales, from the bits of texels: see `pyramid` in jaxprt/systems/lobe/pyramid.py. A byte has
-// two rows of four texels, and the bytes of all vertices of a part stand together.
-function means(content, bits, index) {
+// two rows of four texels, and the bytes of all vertices of a part stand together. Frames come between slices of the work.
+async function means(content, bits, index) {
   const { texelEdge: size, edges, stride } = content, result = new Uint8Array(4 * Math.ceil((content.means + 1) / 4));
   const { area } = grid(size), across = size / 4, whole = [], table = new Float32Array(256 * (size / 2) * across);
   for (let edge = across; edge >= 1; edge /= 2) whole.push({ edge, area: grid(edge).area, value: new Float32Array(6 * edge * edge) });
+  let due = performance.now() + SLICE;
+  const rest = async () => { await pause(); due = performance.now() + SLICE; };
   for (let byte = 0; byte < (size / 2) * across; byte++) for (let bit = 0; bit < 8; bit++) {
+    if (performance.now() > due) await rest();
     const row = 2 * Math.floor(byte / across) + ((bit >> 1) & 1), column = 4 * (byte % across) + 2 * (bit >> 2) + (bit & 1);
     const share = area[row * size + column] / whole[0].area[(row >> 2) * across + (column >> 2)];
     for (let value = 0; value < 256; value++) if ((value >> bit) & 1) table[256 * byte + value] += share;
   }
   for (const part of content.parts) for (let vertex = 0; part.lobes && vertex < part.count; vertex++) {
+    if (performance.now() > due) await rest();
     const { value: finest } = whole[0];
     for (let face = 0, to = 0, byte = 0; face < 6; face++) for (let row = 0; row < across; row++, byte += across) for (let column = 0; column < across; column++, to++, byte++) {
       const on = byte - face * (size / 2) * across, from = part.bitStart + byte * part.count + vertex;
@@ -443,8 +453,9 @@ class Answers {
     this.skies = content.skies.map((sky, i) => sky && { content: sky, buffers: [buffers[buffers.length - content.skies.slice(i).filter(Boolean).length]] });
   }
   // Colors of the vertices, for who has no picture.
-  look(message) {
+  async look(message) {
     const began = performance.now(), { piece } = this;
+    await piece.expand();
     if (!piece.gl || piece.gl.isContextLost()) {
       const gl = document.createElement("canvas").getContext("webgl2");
       if (!gl) throw new Error("this browser has no WebGL2, which the viewer needs");
@@ -501,7 +512,7 @@ export function answers(content, buffers) {
   const piece = new Answers(content, buffers);
   return async (message, given = []) => {
     try {
-      return piece.answer(message, given);
+      return await piece.answer(message, given);
     } catch (error) {
       return { content: { kind: "error", of: message.kind, message: `${message.name ?? "the viewer"} ${error.message}` }, buffers: [] };
     }

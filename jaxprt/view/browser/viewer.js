@@ -82,16 +82,19 @@ export function mount(root, ask) {
     try {
       const { content, buffers } = await ask({ kind: "page", viewer, system });
       if (closed || asked !== system) return;
+      lacking = content.missing ?? content.message ?? "";
+      const piece = content.kind === "page" && !lacking ? new Piece(content, [...from.buffers, ...buffers]) : null;
+      await piece?.expand();
+      if (closed || asked !== system) return;
       gpu?.close();
       gpu = null;
-      lacking = content.missing ?? content.message ?? "";
-      if (content.kind === "page" && !lacking) gpu = new Pixels(drawing.gl, new Piece(content, [...from.buffers, ...buffers]), 3 * (from.backs ?? from.face.length / 3));
+      if (piece) gpu = new Pixels(drawing.gl, piece, 3 * (from.backs ?? from.face.length / 3));
     } catch (error) { lacking = error.message; }
     canvas.pixels = () => gpu;
     if (gpu && scene === from) moved();
   };
   // Whether the GPU shades the present state. A slow one leaves it to Python, if that is quicker.
-  const shades = () => gpu !== null && asked === state.system && !state.bounces && !gpu.piece.fixed(state.materials) && !(gpu.slow && scene.rests.length && (looked < TRIES || stats.trip < 2 * gpu.stats.ms));
+  const shades = () => gpu !== null && asked === state.system && gpu.piece.content.system === state.system && !state.bounces && !gpu.piece.fixed(state.materials) && !(gpu.slow && scene.rests.length && (looked < TRIES || stats.trip < 2 * gpu.stats.ms));
   const describe = () => {
     const { level, samples, ms } = gpu.stats;
     const size = samples ? `pixels of ${samples} sample${samples > 1 ? "s" : ""}` : level ? (level === 1 ? "pixels" : `pixels of ${level} x ${level}`) : "vertices";
