@@ -45,7 +45,6 @@ METALS = {  # specular weights of case and bracelet, and roughness
 }
 _RUST, _GOLD = np.array([0.6, 0.14, 0.05]), np.array([1.0, 0.72, 0.28])
 _STRONGER = 3  # how many times what the bust sends to the walls is shown
-_RAYS = 16  # of mirror images, for each pixel
 _FACING = 0.1  # least cosine by which a surface looks away from the lamp, or down
 
 
@@ -375,7 +374,7 @@ class Figures:
             first = None
             for n in (6.0, 60.0, 200.0):
                 look = {1: (ground, base, n)} if part else {0: (color, gloss, n)}
-                drawn = self.layers(made, look, rays=_RAYS)
+                drawn = self.layers(made, look, rays=paper_scenes.RAYS)
                 first = drawn.color if first is None else first
                 changed = off(drawn.color, first, drawn.region(other))
                 lines.append({"part": name, "exponent": n, "changed": changed})
@@ -389,7 +388,7 @@ class Figures:
         ours, theirs, lines = {}, {}, []
         for n in (20.0, 60.0, 200.0):
             look = {0: (0.02, color, n)}
-            drawn = self.layers(made, look, rays=_RAYS)
+            drawn = self.layers(made, look, rays=paper_scenes.RAYS)
             inside, wall = self.inside(drawn), drawn.region(0)
             line = {"exponent": n, "peak": _peak(drawn.color, inside), "inside": mean(drawn.color, inside)}
             caption = f"exponent {n:g}"
@@ -411,7 +410,9 @@ class Figures:
         black = self.layers(made, _watch(0.0, 0.0, 0.2), light=light, camera=camera)
         table = black.region(3) & (np.abs(black.position[..., 0]) < 1.6) & (np.abs(black.position[..., 2]) < 2.2)
         for name, (case, bracelet, m) in METALS.items():
-            color = self.layers(made, _watch(case, bracelet, m), light=light, camera=camera, rays=_RAYS).color
+            color = self.layers(
+                made, _watch(case, bracelet, m), light=light, camera=camera, rays=paper_scenes.RAYS
+            ).color
             sent = np.where(black.region(3)[..., None], color[..., :3] - black.color[..., :3], 0)
             line = {"metal": name, "m": m, "sent": float(sent[table].sum() / black.color[table][:, :3].sum())}
             line["color"] = [float(value) for value in sent[table].sum(0) / sent[table].sum(0).max()]

@@ -55,6 +55,7 @@ from jaxprt.systems.bounces.functions import FunctionWeights
 EDGE = 512  # pixels
 KINDS = ("view", "material", "light")  # of frames
 EXPONENTS, _FINE = (200.0, 60.0, 20.0), 40  # of sharp light paths, from the sharpest; edge of their maps in texels
+RAYS = 16  # of mirror images, which scenes have after `with_rays`
 SIZE, BOUNCES = 32, 2  # edge of the light's faces for direct light, and number of bounces
 
 
@@ -135,7 +136,13 @@ def prepare(name: str, *, quick: bool = False, store: pathlib.Path | None = None
     start = time.perf_counter()
     marks = "_".join(f"{key}{value}" for key, value in {"direct": size, **wanted}.items())
     try:
-        options = {"refine": False, "size": size, "rays": 0, "progress": False, "path": path and path / f"direct{size}"}
+        options = {
+            "refine": False,
+            "size": size,
+            "rays": RAYS,
+            "progress": False,
+            "path": path and path / f"direct{size}",
+        }
         system = Dynamic(lobes=4, ranks=None) if quick else Dynamic()
         scene = prt.Scene(parts, [camera_of(recipe, whole)])
         scene = prt.precompute(scene, system=system, bounces=1 if wanted else count, **options)
@@ -143,7 +150,7 @@ def prepare(name: str, *, quick: bool = False, store: pathlib.Path | None = None
             scene = with_transfer(scene, path and path / marks, bounces=count, **wanted)
     finally:
         seconds, peak = _spent(path and path / f"{marks}_bounces{count}.json", time.perf_counter() - start)
-    return Made(name, recipe, scene, seconds, peak)
+    return Made(name, recipe, scene.with_rays(0), seconds, peak)
 
 
 def rms(value: Any) -> float:
@@ -246,7 +253,7 @@ def table(lines: Sequence[Mapping[str, Any]]) -> str:
         lines: What was reported, of any scenes; those whose frames are not all there are left out.
     """
     rows = [
-        "| scene (the paper's) | vertices | regions, free | precomputation, minutes | tensor, MB | peak, GB "
+        "| scene (the paper's) | vertices | regions, free | precomputation, minutes | storage, MB | peak, GB "
         "| new view, fps | new material, fps | new light, fps |",
         "|---" * 9 + "|",
     ]
@@ -263,7 +270,7 @@ def table(lines: Sequence[Mapping[str, Any]]) -> str:
             f"{first['vertices']:,}{theirs[0]}",
             f"{first['regions']}, {first['adjustable']}" + ("" if row is None else f" ({row.adjustable} free)"),
             f"{first['seconds'] / 60:.1f}{theirs[1]}",
-            f"{first['bytes'] / 1e6:.0f}{theirs[2]}",
+            f"{(first['bytes'] + first['direct_bytes']) / 1e6:.0f}{theirs[2]}",
             f"{first['peak_bytes'] / 1e9:.1f}",
             *(f"{line['fps']:.1f}{fps}" for line, fps in zip(each, theirs[3:], strict=True)),
         ]
