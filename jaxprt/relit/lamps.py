@@ -141,7 +141,8 @@ def split(lamp: SceneLamps | None, materials: Any) -> tuple[Any, dict[str, Point
     """Separates a dictionary of materials into materials of parts and point lights. Other values are kept as they are.
 
     Raises:
-        ValueError: There is no point light of the given name, or it has moved since precomputation.
+        ValueError: There is no point light of the given name, or it moved, turned or got another cone since
+            precomputation.
     """
     if not isinstance(materials, Mapping):
         return materials, {}
@@ -151,12 +152,28 @@ def split(lamp: SceneLamps | None, materials: Any) -> tuple[Any, dict[str, Point
     for name, light in changed.items():
         if name not in known:
             raise ValueError(f"point lights must be among those of the scene, {list(known)}, got one named {name!r}")
-        now, then = light.position, known[name].position
-        if isinstance(now, Tracer) or isinstance(then, Tracer):
-            continue
-        if not np.array_equal(np.asarray(now), np.asarray(then)):
+        then = known[name]
+        if not _same(light.position, then.position):
             raise ValueError(
-                f"point light {name!r} was traced from {np.asarray(known[name].position).tolist()}, got one at "
+                f"point light {name!r} was traced from {np.asarray(then.position).tolist()}, got one at "
                 f"{np.asarray(light.position).tolist()}: precompute the scene with it there"
             )
+        if light.axis is None and then.axis is None:
+            continue
+        if not _same(light.axis, then.axis) or light.cone != then.cone:
+            raise ValueError(
+                f"point light {name!r} was traced with the axis and cone {_aim(then)}, got {_aim(light)}: precompute "
+                "the scene with these"
+            )
     return of_parts, changed
+
+
+def _same(now: Any, then: Any) -> bool:
+    """Whether two values are equal, as far as that is known."""
+    if isinstance(now, Tracer) or isinstance(then, Tracer):
+        return True
+    return (now is None) == (then is None) and np.array_equal(np.asarray(now), np.asarray(then))
+
+
+def _aim(light: PointLight) -> str:
+    return "of all directions" if light.axis is None else f"{np.asarray(light.axis).tolist()}, {light.cone}"

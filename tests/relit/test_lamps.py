@@ -246,6 +246,10 @@ def test_what_was_not_precomputed_is_refused():
             "'floor' was precomputed without emis",
         ),
         ({"bulb": PointLight("bulb", [0, 1, 0], 1.0)}, "point light 'bulb' was traced from"),
+        (
+            {"bulb": PointLight("bulb", BULB.position, 1.0, axis=[0, -1, 0])},
+            r"traced with the axis and cone of all directions, got \[0.0, -1.0, 0.0\], \(0.0",
+        ),
         ({"sun": PointLight("sun", [0, 1, 0], 1.0)}, r"point lights must be among those of the scene, \['bulb'\]"),
     ]
     for materials, message in given:
