@@ -79,15 +79,15 @@ def soft_box(direction: Any, degrees: float, dim: float, *, size: int) -> Enviro
     return add_disk(light, np.asarray(direction, float), angle=float(angle), radiance=float(1 / np.sin(angle) ** 2))
 
 
-def models(made: Made, changed: Look | None = None) -> list[Any]:
+def models(ready: Made, changed: Look | None = None) -> list[Any]:
     """BRDFs of all regions, for Mitsuba; `changed` is that of `Made.materials`."""
-    free = made.materials(changed)
-    names = [part.name for part in made.scene.scene.parts]
-    return [free.get(name) or Lambert(made.recipe.fixed[int(name)]) for name in names]
+    free = ready.materials(changed)
+    names = [part.name for part in ready.scene.scene.parts]
+    return [free.get(name) or Lambert(ready.recipe.fixed[int(name)]) for name in names]
 
 
 def traced(
-    made: Made,
+    ready: Made,
     changed: Look | None = None,
     *,
     camera: Camera,
@@ -98,15 +98,15 @@ def traced(
 ) -> np.ndarray:
     """Mitsuba's picture of a scene with so many bounces, with the coverage of ours."""
     radiance = path_tracing.picture(
-        joined_mesh(made.scene.shading),
-        models(made, changed),
-        paper_scenes.light_of(made) if light is None else light,
+        joined_mesh(ready.scene.shading),
+        models(ready, changed),
+        paper_scenes.light_of(ready) if light is None else light,
         camera,
         depth=2 + bounces,
         samples=samples,
         seed=seed,
     )
-    return np.concatenate([radiance, made.scene.coverage(camera)[..., None]], -1)
+    return np.concatenate([radiance, ready.scene.coverage(camera)[..., None]], -1)
 
 
 def off(mine: np.ndarray, exact: np.ndarray, where: np.ndarray | None = None) -> float:
@@ -143,7 +143,7 @@ class Exact(NamedTuple):
         """
         inside = (mine[..., 3] == 1) & (self.first[..., 3] == 1)
         inside = inside if where is None else inside & where
-        one, other, ours = (each[inside][:, :3].astype(np.float64) for each in (self.first, self.second, mine))
+        one, other, ours = (picture[inside][:, :3].astype(np.float64) for picture in (self.first, self.second, mine))
         square, whole = np.sum((ours - one) * (ours - other)), np.sum(one * other)
         return float(np.sqrt(max(square, 0.0) / whole))
 
@@ -202,19 +202,19 @@ class Figures:
             self.scenes[key] = paper_scenes.prepare(name, quick=self.quick, store=self.store, **options)
         return self.scenes[key]
 
-    def camera(self, made: Made, **options: Any) -> Camera:
+    def camera(self, ready: Made, **options: Any) -> Camera:
         """The camera of a scene."""
-        return paper_scenes.camera_of(made.recipe, made.scene.mesh, edge=self.edge, **options)
+        return paper_scenes.camera_of(ready.recipe, ready.scene.mesh, edge=self.edge, **options)
 
-    def lamp(self, made: Made) -> Environment:
+    def lamp(self, ready: Made) -> Environment:
         """The lamp of a scene."""
-        size = made.scene.light_size
+        size = ready.scene.light_size
         assert size is not None
-        return soft_box(*LAMPS[made.name], size=size)
+        return soft_box(*LAMPS[ready.name], size=size)
 
     def layers(
         self,
-        made: Made,
+        ready: Made,
         changed: Look | None = None,
         *,
         light: Environment | None = None,
@@ -222,10 +222,10 @@ class Figures:
         rays: int = 0,
     ) -> Layers:
         """A picture with other materials, in the light of the scene's recipe unless another one is given."""
-        layers = made.scene.with_rays(rays).picture(
-            paper_scenes.light_of(made) if light is None else light,
-            self.camera(made) if camera is None else camera,
-            materials=made.materials(changed),
+        layers = ready.scene.with_rays(rays).picture(
+            paper_scenes.light_of(ready) if light is None else light,
+            self.camera(ready) if camera is None else camera,
+            materials=ready.materials(changed),
             background=None,
             layers=list(LAYERS),
         )
@@ -235,27 +235,27 @@ class Figures:
         normal = layer["normal"] / np.maximum(np.linalg.norm(layer["normal"], axis=-1, keepdims=True), 1e-6)
         return Layers(color, direct, normal, layer["position"], layer["part"])
 
-    def mitsuba(self, made: Made, changed: Look | None = None, **options: Any) -> Exact | None:
+    def mitsuba(self, ready: Made, changed: Look | None = None, **options: Any) -> Exact | None:
         """Mitsuba's picture; None where it is not asked for."""
         if not self.compare:
             return None
-        return Exact(*(traced(made, changed, samples=self.samples, seed=seed, **options) for seed in (0, 1)))
+        return Exact(*(traced(ready, changed, samples=self.samples, seed=seed, **options) for seed in (0, 1)))
 
     def figure_1(self) -> Sheet:
         """A bust whose BRDF moves along a curve in the plane of Fresnel reflectance and roughness.
 
         Above the pictures, below what the bust sends to floor and walls: the difference from a black bust.
         """
-        made = self.scene("bust")
-        light, camera = self.lamp(made), self.camera(made)
+        ready = self.scene("bust")
+        light, camera = self.lamp(ready), self.camera(ready)
         curve = [(0.05, 0.8), (0.2, 0.4), (0.6, 0.2), (1.0, 0.1)]
         shares = [(1.0, 0.3), (0.6, 0.5), (0.25, 0.8), (0.02, 1.0)]
         pictures, sent, lines = {}, {}, []
-        black = self.layers(made, {0: (0.0, 0.0, [0.5, 0.5])}, light=light, camera=camera)
+        black = self.layers(ready, {0: (0.0, 0.0, [0.5, 0.5])}, light=light, camera=camera)
         walls = black.region(1, 2, 3)
         for (f0, m), (diffuse, specular) in zip(curve, shares, strict=True):
             look = (diffuse * _RUST, specular * _GOLD, [f0, m])
-            color = self.layers(made, {0: look}, light=light, camera=camera).color
+            color = self.layers(ready, {0: look}, light=light, camera=camera).color
             pictures[f"F0 {f0:g}, m {m:g}"] = _beside(color, self.ball(look, light, camera))
             reached = np.where(walls[..., None], color[..., :3] - black.color[..., :3], 0)
             first = next(iter(sent.values()))[..., :3] / _STRONGER if sent else reached
@@ -289,18 +289,18 @@ class Figures:
 
         All come from one tensor: light of few texels is the same radiance in the texels of each of its larger ones.
         """
-        made, pictures, lines = self.scene("ring"), {}, []
-        light, camera = paper_scenes.light_of(made), self.camera(made)
-        assert made.scene.bounces is not None
-        once = eqx.tree_at(lambda relit: relit.bounces.tensor.second, made.scene, None, is_leaf=lambda x: x is None)
-        made, exact, inside = made._replace(scene=once), None, None
+        ready, pictures, lines = self.scene("ring"), {}, []
+        light, camera = paper_scenes.light_of(ready), self.camera(ready)
+        assert ready.scene.bounces is not None
+        once = eqx.tree_at(lambda relit: relit.bounces.tensor.second, ready.scene, None, is_leaf=lambda x: x is None)
+        ready, exact, inside = ready._replace(scene=once), None, None
         if self.compare:
-            whole, direct = (self.mitsuba(made, camera=camera, bounces=n) for n in (1, 0))
+            whole, direct = (self.mitsuba(ready, camera=camera, bounces=n) for n in (1, 0))
             assert whole is not None
             assert direct is not None
             exact = Exact(*(_less(*pair) for pair in zip(whole, direct, strict=True)))
         for edge in (2, 4) if self.quick else (4, 8, 16):
-            drawn = self.layers(made, light=blocks(light, edge), camera=camera)
+            drawn = self.layers(ready, light=blocks(light, edge), camera=camera)
             picture, inside = _less(drawn.color, drawn.direct), self.inside(drawn)
             line = {"light": f"6 x {edge} x {edge}", "mean": mean(picture, inside), "peak": _peak(picture, inside)}
             caption = f"{line['light']}\nmean {line['mean']:.3f}, peak {line['peak']:.2f}"
@@ -322,15 +322,15 @@ class Figures:
 
     def figure_11(self) -> Sheet:
         """A ray tracer, direct light, and interreflection; measured where the bird looks down at the blue ground."""
-        made = self.scene("bird")
+        ready = self.scene("bird")
         eye, target, angle = BELOW
-        recipe = made.recipe._replace(camera=(eye, target, angle))
-        camera = paper_scenes.camera_of(recipe, made.scene.mesh, edge=self.edge)
-        light = self.lamp(made)
-        drawn = self.layers(made, BIRD, light=light, camera=camera)
+        recipe = ready.recipe._replace(camera=(eye, target, angle))
+        camera = paper_scenes.camera_of(recipe, ready.scene.mesh, edge=self.edge)
+        light = self.lamp(ready)
+        drawn = self.layers(ready, BIRD, light=light, camera=camera)
         chest = drawn.region(0, toward=(0, -1, 0))
         pictures, lines = {}, []
-        exact = self.mitsuba(made, BIRD, light=light, camera=camera)
+        exact = self.mitsuba(ready, BIRD, light=light, camera=camera)
         named = {"direct light": drawn.direct, "two bounces": drawn.color}
         if exact is not None:
             named = {"Mitsuba 3, two bounces": exact.picture, **named}
@@ -347,19 +347,19 @@ class Figures:
 
     def figure_12(self) -> Sheet:
         """A room: direct light, with bounces, and after adjusting floor, sofa and walls."""
-        made = self.scene("room")
+        ready = self.scene("room")
         shiny = {0: ([0.1, 0.1, 0.12], 0.6, 200.0)}
         green = {1: ([0.1, 0.45, 0.12], 0.1, 20.0), 0: ([0.5, 0.12, 0.08], 0.2, 60.0)}
         walls = {2: ([0.15, 0.3, 0.6], 0.05, 6.0)}
-        turned = paper_scenes.turned(paper_scenes.light_of(made), -0.5)
-        first = self.layers(made)
+        turned = paper_scenes.turned(paper_scenes.light_of(ready), -0.5)
+        first = self.layers(ready)
         pictures = {
             "direct light": first.direct,
             "two bounces": first.color,
-            "shiny dark floor": self.layers(made, shiny).color,
-            "red floor, green sofa": self.layers(made, green).color,
-            "blue walls": self.layers(made, walls).color,
-            "light turned": self.layers(made, light=turned).color,
+            "shiny dark floor": self.layers(ready, shiny).color,
+            "red floor, green sofa": self.layers(ready, green).color,
+            "blue walls": self.layers(ready, walls).color,
+            "light turned": self.layers(ready, light=turned).color,
         }
         fixed = first.region(3, 4, 5, 6, 7, 8, 9)  # parts whose materials stay
         lines = [{"picture": name, "changed": off(picture, first.color, fixed)} for name, picture in pictures.items()]
@@ -367,14 +367,14 @@ class Figures:
 
     def figure_13(self) -> Sheet:
         """Shininess of a base, above, and of what stands on it, below."""
-        made = self.scene("airplane")
+        ready = self.scene("airplane")
         (color, gloss, _), (ground, base, _) = (RECIPES["airplane"].free[number] for number in (0, 1))
         pictures, lines = {}, []
         for part, name, other in ((1, "base", 0), (0, "object", 1)):
             first = None
             for n in (6.0, 60.0, 200.0):
                 look = {1: (ground, base, n)} if part else {0: (color, gloss, n)}
-                drawn = self.layers(made, look, rays=paper_scenes.RAYS)
+                drawn = self.layers(ready, look, rays=paper_scenes.RAYS)
                 first = drawn.color if first is None else first
                 changed = off(drawn.color, first, drawn.region(other))
                 lines.append({"part": name, "exponent": n, "changed": changed})
@@ -383,16 +383,16 @@ class Figures:
 
     def ring(self) -> Sheet:
         """The caustic of Figure 13: exponents of a ring, with direct light and both bounces."""
-        made = self.scene("ring")
-        color, camera = RECIPES["ring"].free[0][1], self.camera(made)
+        ready = self.scene("ring")
+        color, camera = RECIPES["ring"].free[0][1], self.camera(ready)
         ours, theirs, lines = {}, {}, []
         for n in (20.0, 60.0, 200.0):
             look = {0: (0.02, color, n)}
-            drawn = self.layers(made, look, rays=paper_scenes.RAYS)
+            drawn = self.layers(ready, look, rays=paper_scenes.RAYS)
             inside, wall = self.inside(drawn), drawn.region(0)
             line = {"exponent": n, "peak": _peak(drawn.color, inside), "inside": mean(drawn.color, inside)}
             caption = f"exponent {n:g}"
-            exact = self.mitsuba(made, look, camera=camera)
+            exact = self.mitsuba(ready, look, camera=camera)
             if exact is not None:
                 line |= {"error_inside": exact.off(drawn.color, inside), "error_wall": exact.off(drawn.color, wall)}
                 line["error_whole"] = exact.off(drawn.color)
@@ -404,15 +404,13 @@ class Figures:
 
     def figure_14(self) -> Sheet:
         """A watch of four metals, above; below, what it sends to the table: the difference from a black watch."""
-        made = self.scene("watch")
-        light, camera = self.lamp(made), self.camera(made)
+        ready = self.scene("watch")
+        light, camera = self.lamp(ready), self.camera(ready)
         pictures, glow, lines = {}, {}, []
-        black = self.layers(made, _watch(0.0, 0.0, 0.2), light=light, camera=camera)
+        black = self.layers(ready, _watch(0.0, 0.0, 0.2), light=light, camera=camera)
         table = black.region(3) & (np.abs(black.position[..., 0]) < 1.6) & (np.abs(black.position[..., 2]) < 2.2)
         for name, (case, bracelet, m) in METALS.items():
-            color = self.layers(
-                made, _watch(case, bracelet, m), light=light, camera=camera, rays=paper_scenes.RAYS
-            ).color
+            color = self.layers(ready, _watch(case, bracelet, m), light=light, camera=camera).color
             sent = np.where(black.region(3)[..., None], color[..., :3] - black.color[..., :3], 0)
             line = {"metal": name, "m": m, "sent": float(sent[table].sum() / black.color[table][:, :3].sum())}
             line["color"] = [float(value) for value in sent[table].sum(0) / sent[table].sum(0).max()]
@@ -424,11 +422,11 @@ class Figures:
 
     def figure_15(self) -> Sheet:
         """Chess with the light behind the board: direct light, and with bounces; measured where pieces look away."""
-        made = self.scene("chess")
-        light, camera = self.lamp(made), self.camera(made)
-        drawn = self.layers(made, light=light, camera=camera)
+        ready = self.scene("chess")
+        light, camera = self.lamp(ready), self.camera(ready)
+        drawn = self.layers(ready, light=light, camera=camera)
         away = drawn.region(0, 1, toward=-np.asarray(LAMPS["chess"][0]))
-        exact = self.mitsuba(made, light=light, camera=camera)
+        exact = self.mitsuba(ready, light=light, camera=camera)
         pictures, lines = {}, []
         named = {"direct light": drawn.direct, "two bounces": drawn.color}
         if exact is not None:
