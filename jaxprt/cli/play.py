@@ -29,6 +29,7 @@ _OPENING = 5.0  # most seconds in which a browser that was opened can still lear
 # What the names of the work of `jaxprt.precompute` mean.
 _STAGES = {
     "refine": "dividing the meshes where shadows are fine",
+    "preview": "tracing rays for a preview",
     "visibility": "tracing rays",
     "lamps": "tracing rays to lamps",
     "compress": "compressing what the rays have seen",
@@ -215,7 +216,7 @@ def _way(systems: int, *, refine: bool, bounces: bool) -> list[tuple[str, float]
     """The stages of `prepare`, each with its part of the time. The first system has previews."""
     stages = []
     for number in range(systems):
-        preview = [("visibility", _PREVIEW)] if number == 0 else []
+        preview = [("preview", _PREVIEW)] if number == 0 else []
         division = [("refine", _DIVISION), *preview] if refine else []
         stages += [*preview, *division, ("visibility", _RAYS), *(_REFLECTION if bounces else ())]
     return [*((_STAGES[name], part) for name, part in stages), (COMPILING, _COMPILING)]

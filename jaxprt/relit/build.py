@@ -125,7 +125,7 @@ def precompute(
         folder.mkdir(parents=True, exist_ok=True)
     coarse = None
     if preview is not None and recipes is not None:
-        coarse = _coarse(scene, recipes, size or _SIZE, folder, progress, rays=rays, copied=copied)
+        coarse = _coarse(scene, recipes, size or _SIZE, folder, _of_preview(progress), rays=rays, copied=copied)
         if coarse is not None:
             preview(coarse)
     before = scene
@@ -139,7 +139,7 @@ def precompute(
     size = _SIZE if size is None else size
     fields = {"rays": rays, "division": divided, "copied": copied}
     if preview is not None and scene is not before and coarse is not None:
-        coarse = _coarse(scene, recipes, size, folder, progress, **fields)
+        coarse = _coarse(scene, recipes, size, folder, _of_preview(progress), **fields)
         if coarse is not None:
             preview(coarse)
     near = centered(scene)
@@ -154,6 +154,11 @@ def precompute(
     # One store serves any number of bounces: a larger number resumes from a smaller one.
     target = Target(traced.near.mesh, size=size, run=run.within("scene"))
     return traced.relit(traced.reflected(bounces, target, rays=rays), **fields)
+
+
+def _of_preview(progress: Progress) -> Progress:
+    """Progress whose labels start with "preview", if it is a function."""
+    return (lambda label, share: progress(f"preview {label}", share)) if callable(progress) else progress
 
 
 def _as_shaded(scene: Scene, shadings: Sequence[Shading]) -> Scene:

@@ -76,11 +76,11 @@ def test_previews_divided_meshes_and_systems_are_one_way(place, monkeypatch):
         shares.append(session.progress.content()["fraction"])
 
     monkeypatch.setattr(session, "report", heard)
-    play.prepare(session, options(str(place / "first.obj"), "--lobes", "1,2", "--light-size", "8", "--bounces", "1"))
+    play.prepare(session, options(str(place / "first.obj"), "--lobes", "1,2", "--light-size", "8"))
     told = [share for share in shares if share is not None]
-    assert len(told) > 4
+    assert len(told) > 2, told
     assert told == sorted(told)
-    assert 0.5 < told[-1] < 1
+    assert 0.2 < told[-1] < 1, told
 
 
 def test_without_files_there_are_the_chess_pieces_in_two_lights():
