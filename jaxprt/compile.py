@@ -14,7 +14,7 @@ import importlib.metadata
 import os
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial, reduce
 from typing import Any, TypeVar, cast
 
@@ -136,12 +136,11 @@ def isolated(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:
 
         shape = jax.eval_shape(whole, argument, named)
         first = next(leaf for leaf in jax.tree.leaves((argument, named)) if leaf.size)
+        first = _any_of_batch.bind(jax.lax.stop_gradient(first).ravel()[0].astype(jnp.int32))
         # A branch is not fused with its surroundings. The CPU compiler does not detect that this branch is always
         # taken;
         # other compilers do, and remove the branch.
-        taken = jax.lax.platform_dependent(
-            jax.lax.stop_gradient(first).ravel()[0].astype(jnp.int32), cpu=lambda x: (x | 1) != 0, default=_always
-        )
+        taken = jax.lax.platform_dependent(first, cpu=lambda x: (x | 1) != 0, default=_always)
         return jax.lax.cond(taken, whole, never, argument, named)
 
     inside = jit(branched, static_argnames=static)  # traced once, also for derivatives outside of any jit
@@ -251,22 +250,29 @@ def _blocks(rows: PyTree, size: int) -> tuple[PyTree | None, PyTree]:
 
 
 def linear(
-    forward: Callable[[Fixed, Array], Array], backward: Callable[[Fixed, Array], Array], fixed: Fixed, x: Array
+    forward: Callable[[Fixed, Array], Array],
+    backward: Callable[[Fixed, Array], Array] | None,
+    fixed: Fixed,
+    x: Array,
+    *,
+    in_turn: bool = False,
 ) -> Array:
-    """Applies a linear map whose transpose is given explicitly.
+    """Applies a linear map whose transpose is given explicitly, or whose batches are mapped one by one.
 
     Args:
         forward: Function (fixed, x) -> y, linear in x. JAX differentiates it with respect to `fixed`, also for the
             derivatives of the transpose.
-        backward: Transpose of `forward`, (fixed, y) -> array like x. It is not checked to be the transpose.
+        backward: Transpose of `forward`, (fixed, y) -> array like x. It is not checked to be the transpose. None to
+            derive it.
         fixed: Parameters of the map. The transpose may use more of them than the map.
         x: An array.
+        in_turn: Whether CPUs map a batch of x one by one, where the parameters are the same for all.
 
     Returns:
         The map applied to x. Its gradient in x uses `backward`, the gradient of that uses `forward`, and so on.
     """
     leaf, tree = jax.tree.flatten(fixed)
-    return _linear.bind(x, *leaf, pair=_Pair(forward, backward, tree, x.shape, x.dtype), back=False)
+    return _linear.bind(x, *leaf, pair=_Pair(forward, backward, tree, x.shape, x.dtype, in_turn), back=False)
 
 
 @dataclass(frozen=True)
@@ -274,13 +280,16 @@ class _Pair:
     """A linear map and its transpose, without their arrays."""
 
     forward: Callable
-    backward: Callable
+    backward: Callable | None
     tree: Any
     shape: tuple[int, ...]  # of x
     dtype: Any
+    in_turn: bool = False
 
     def run(self, x: Array, *leaf: Array, back: bool) -> Array:
         fixed = self.tree.unflatten(leaf)
+        if back and self.backward is None:
+            return self.derived(x, *leaf, back=True)
         return self.backward(fixed, x).astype(self.dtype) if back else self.forward(fixed, x)
 
     def derived(self, x: Array, *leaf: Array, back: bool) -> Array:
@@ -297,8 +306,11 @@ class _Batch:
 
     function: Callable
     axis: tuple[int | None, ...]
+    in_turn: bool
 
     def __call__(self, fixed: PyTree, x: Array) -> Array:
+        if self.in_turn:
+            return mapped(partial(self.function, fixed), x)
         leaf, tree = jax.tree.flatten(fixed)
         return jax.vmap(lambda x, *leaf: self.function(tree.unflatten(leaf), x), (0, *self.axis))(x, *leaf)
 
@@ -340,7 +352,9 @@ def _batched(argument, axis, *, pair: _Pair, back: bool):
     if axis[0] is None:
         x = jnp.broadcast_to(x, (size, *x.shape))
     axes = tuple(None if n is None else 0 for n in axis[1:])
-    wide = _Pair(_Batch(pair.forward, axes), _Batch(pair.backward, axes), pair.tree, (size, *pair.shape), pair.dtype)
+    kind = partial(_Batch, axis=axes, in_turn=pair.in_turn and not any(n is not None for n in axes))
+    backward = None if pair.backward is None else kind(pair.backward)
+    wide = replace(pair, forward=kind(pair.forward), backward=backward, shape=(size, *pair.shape))
     return _linear.bind(x, *leaf, pair=wide, back=back), 0
 
 
@@ -352,6 +366,14 @@ mlir.register_lowering(_linear, mlir.lower_fun(_stepwise, multiple_results=False
 ad.primitive_jvps[_linear] = _jvp
 ad.primitive_transposes[_linear] = _transpose
 batching.primitive_batchers[_linear] = _batched
+
+
+# A number, of which a batch has one too: a branch on it remains a branch in batches, which choose by one.
+_any_of_batch = Primitive("any_of_batch")
+_any_of_batch.def_impl(lambda x: x)
+_any_of_batch.def_abstract_eval(lambda x: x)
+mlir.register_lowering(_any_of_batch, lambda _, x: [x])
+batching.primitive_batchers[_any_of_batch] = lambda argument, axis: (jnp.take(argument[0], 0, axis[0]), None)
 
 
 def shared_size(count: int, *, fine: bool = False) -> int:

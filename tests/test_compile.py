@@ -219,3 +219,22 @@ def test_programs_for_gpus_have_no_loops_over_rows_no_branches_to_choose_and_exa
 
 def test_products_inside_maps_and_their_transposes_are_exact(matrix, x, loose):
     assert not loose(jax.grad(ours), x, matrix)
+
+
+def test_in_a_batch_a_step_remains_a_branch_of_its_own():
+    step = jax.vmap(isolated(lambda x: jnp.sin(x) + 1))
+    text = jax.jit(step).lower(jnp.ones((2, 3))).as_text()
+    assert ("case" in text) == (jax.default_backend() == "cpu")
+    np.testing.assert_allclose(step(jnp.array([[0.5], [2.0]])), np.sin([[0.5], [2.0]]) + 1, rtol=1e-6)
+
+
+def test_a_batch_is_mapped_in_turn_with_its_gradient(x, matrix):
+    batch = jnp.stack([x, 2 * x, -x])
+
+    def total(batch):
+        mapped = jax.vmap(lambda x: linear(product, None, {"matrix": matrix, "transpose": None}, x, in_turn=True))
+        return jnp.sum(jnp.sin(mapped(batch)))
+
+    value, slope = jax.value_and_grad(total)(batch)
+    np.testing.assert_allclose(value, np.sum(np.sin(matrix @ batch)), rtol=1e-12)
+    np.testing.assert_allclose(slope, np.swapaxes(matrix, 0, 1) @ np.cos(matrix @ batch), rtol=1e-12)

@@ -7,14 +7,19 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Array, Float, Int
 
 from jaxprt import require
-from jaxprt.relit.groups import Arriving
+from jaxprt.relit import groups
+from jaxprt.relit.groups import Arriving, Surface
 from jaxprt.relit.pictures import PictureView
+from jaxprt.relit.surface import under_lights
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.environment import resized
+from jaxprt.systems.bounces import GroupBounces
+from jaxprt.systems.protocol import Blend
 
 _HELD = 3  # arrays of the size of a picture that are held for each picture while it is made
 _BYTES = 16  # of a pixel of four channels
@@ -145,3 +150,38 @@ def stacked(pictures: Iterator[PictureBlock], lights: int, views: int) -> Any:
         for whole, part in zip(jax.tree.leaves(result), jax.tree.leaves(block.pictures), strict=True):
             whole[block.lights, block.view] = part
     return result
+
+
+def radiance(
+    surfaces: Sequence[Surface],
+    bounces: GroupBounces | None,
+    lights: Float[Array, "l 6 n n c"],
+    blends: Sequence[Blend | None],
+    lamp: Float[Array, "n 3"] | None,
+    view: Any,
+    order: Int[Array | np.ndarray, " v"],
+) -> Float[Array, "l v c"]:
+    """Radiance of the vertices of a scene, or of points on it, under several lights.
+
+    Args:
+        surfaces: The groups.
+        bounces: The system of reflected light; None without bounces.
+        lights: Radiance of the environments.
+        blends: Weights of the channels at the vertices of each group.
+        lamp: Radiance of each lamp; None without lamps.
+        view: The view of the scene, without traced reflections.
+        order: Index of each vertex or point among those of all groups.
+    """
+    reflected: Sequence[Any] = (None,) * len(surfaces)
+    if bounces is not None:
+
+        def arriving(radiance: Float[Array, "6 n n c"]) -> tuple[Array, ...]:
+            return bounces.shade(bounces.light(Environment(radiance)), blends, lamp)
+
+        reflected = jax.vmap(arriving)(lights)
+    tilts, result = view.stage.table.frame is not None, []
+    parts = zip(surfaces, groups.projected(surfaces, lights), reflected, blends, view.group, strict=True)
+    for number, (surface, *rows, blend, viewed) in enumerate(parts):
+        surface = groups.sampled(surface, max(view.stage.place.of_group(number, view.stage.samples)))
+        result.append(under_lights(surface, tuple(rows), lamp, blend, viewed, tilts=tilts))
+    return jax.vmap(groups.ordered, (0, None))(tuple(result), jnp.asarray(order))

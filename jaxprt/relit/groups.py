@@ -24,6 +24,7 @@ from jaxprt.scene import origin as origins
 from jaxprt.scene.material_table import MaterialLook, MaterialTable
 from jaxprt.scene.mesh import frames, join
 from jaxprt.scene.points import Points
+from jaxprt.systems import protocol
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart
 from jaxprt.systems.lamps import LitByLamps
 from jaxprt.systems.protocol import Blend, System
@@ -341,6 +342,15 @@ def direct(surfaces: Sequence[Surface], environment: Environment) -> tuple[PyTre
             shared[key] = lit
         result.append(lit)
     return tuple(result)
+
+
+def projected(surfaces: Sequence[Surface], lights: Float[Array, "l 6 n n c"]) -> tuple[PyTree, ...]:
+    """`protocol.projected` for the systems of all groups. Systems with the same `shared_light` share one result."""
+    shared: dict[Any, PyTree] = {}
+    for surface in surfaces:
+        if surface.system.shared_light not in shared:
+            shared[surface.system.shared_light] = protocol.projected(surface.system, lights)
+    return tuple(shared[surface.system.shared_light] for surface in surfaces)
 
 
 def kinds(shadings: Sequence[Shading], recipes: Sequence[Any]) -> list[list[int]]:

@@ -279,6 +279,18 @@ class RelitScene(System):
             colors.append(radiance(surface, light.at(number), viewed, reflections=reflections))
         return groups.ordered(tuple(colors), self._order())
 
+    @promoted
+    def under_lights(self, lights: Float[Array, "l 6 n n c"], view: SceneView, materials: Any = None) -> Array:
+        """Radiance under several lights, by one program for each group: `System.under_lights`."""
+        if view.reflected is not None:  # Rays hit other numbers of points from each eye.
+            arriving = (protocol.arriving(self, Environment(light), materials) for light in lights)
+            return jnp.stack([self.combine(light, view) for light in arriving])
+        of_parts, changed = scene_lamps.split(self.lamps, materials)
+        appearances = self.appearances(of_parts)
+        blends = [look.blend for look in self._gathered(appearances)]
+        lamp = None if self.lamps is None else self.lamps.radiance(self._all(appearances), changed)
+        return batches.radiance(self.surfaces, self.bounces, lights, blends, lamp, view, self._order())
+
     def _points(self, number: int, stage: Stage) -> tuple[Points, Points | None]:
         """The vertices of a group as points of the scene; or the scene's points on it, and these on the group.
 
@@ -579,8 +591,7 @@ class RelitScene(System):
     ) -> PictureView:
         """All of a picture that does not depend on the light: `picture_view(camera).picture(environment)` renders it.
 
-        It is faster than `picture` for many environments, and stores about a kilobyte for each shaded point. `picture`
-        gives the errors.
+        It is faster than `picture` for many environments, and stores about a kilobyte for each shaded point.
 
         Args:
             camera: As for `picture`.
@@ -774,8 +785,7 @@ class RelitScene(System):
     @property
     def nbytes(self) -> int:
         """Bytes of the systems of all groups, bounces and lamps: transport and BRDFs. Shared arrays count once."""
-        held = self.surfaces, self.bounces
-        return sum({id(leaf): leaf.nbytes for leaf in jax.tree.leaves(held)}.values())
+        return sum({id(leaf): leaf.nbytes for leaf in jax.tree.leaves((self.surfaces, self.bounces))}.values())
 
     def part_system(self, part: int) -> System:
         """The system of direct light of the vertices of one part, given its index, without padding, in NumPy."""

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree, UInt8
 
-from jaxprt.compile import jit, kept
+from jaxprt.compile import jit, kept, mapped
 from jaxprt.relit.groups import Surface, VertexMaterials, material
 from jaxprt.scene.material_table import MaterialLook
 from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import directions
-from jaxprt.systems import bright_texels
+from jaxprt.systems import bright_texels, protocol
 from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.lobe import widened
 from jaxprt.systems.protocol import Blend
@@ -229,3 +229,32 @@ def _lit(
     if surface.lit is not None:
         color = color + surface.lit.combine(arriving[2], seen[2])
     return color if emitted is None else color + emitted
+
+
+@partial(kept, static=("tilts",))
+def under_lights(
+    surface: Surface,
+    lights: tuple[PyTree, PyTree],
+    lamp: Float[Array, "n 3"] | None,
+    blend: Blend | None,
+    viewed: Viewed,
+    *,
+    tilts: bool,
+) -> Float[Array, "l _ c"]:
+    """Radiance of the vertices of a group, or of points on it, under several lights.
+
+    Args:
+        surface: The group.
+        lights: Direct light, from `groups.projected`, and reflected light under each of the lights.
+        lamp: Radiance of each lamp; None without.
+        blend: Weights of the channels at the vertices of the group.
+        viewed: What does not depend on the light.
+        tilts: Whether normal maps tilt the normals.
+    """
+
+    def lit(row: tuple[PyTree, PyTree]) -> Float[Array, "_ c"]:
+        direct = protocol.arriving(surface.system, row[0], blend)
+        direct = surface.system.tilted(direct, surface.frame[:, 2]) if tilts else direct
+        return _lit(surface, (direct, row[1], lamp), viewed.seen, viewed.points, viewed.emitted)
+
+    return mapped(lit, lights)

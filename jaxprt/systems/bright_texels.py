@@ -416,8 +416,9 @@ def texel_radiance(
         excess, visible = (jnp.zeros((1, rows.shape[1]), rows.dtype) for rows in (excess, visible))
     direction, area = (row.astype(excess.dtype) for row in _points(texel, size, samples, place))
     count = direction.shape[1]
-    carried = points is not None and count > 1
-    visible = mapped(points.carry, visible) if carried else visible
+    carried = count > 1
+    if points is not None and carried:
+        visible = mapped(points.carry, visible)
     # Sample points are processed one by one, so that intermediate arrays stay in the processor's cache. A loop over the
     # points of a texel within one over texels takes three times as long on CPUs.
     rows = direction.reshape(-1, 3), area.reshape(-1, 3), jnp.repeat(jnp.arange(len(texel)), count)

@@ -18,13 +18,15 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree, UInt8
 
 from jaxprt import require
-from jaxprt.compile import promoted
+from jaxprt.compile import mapped, promoted
 from jaxprt.scene import origin as origins
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import Points, placed
 
 CHANNELS = 4  # most channels of a BRDF's table that exported pages hold
 _KNOTS = 64  # most knots of its parameter
+# Bytes of what lights of a batch become at all vertices together, and of one at a vertex: some dozen terms of 3 colors.
+_ROOM, _PER_VERTEX = 1 << 28, 512
 
 
 class System(eqx.Module):
@@ -89,6 +91,18 @@ class System(eqx.Module):
         Raises:
             TypeError: The light or the view was not made by this kind of system.
         """
+
+    def under_lights(
+        self, lights: Float[Array, "l 6 n n c"], view: PyTree, materials: PyTree = None
+    ) -> Float[Array, "l v _"]:
+        """Radiance under several lights by one program.
+
+        Args:
+            lights: Radiance of the environments.
+            view: The result of `view`.
+            materials: As for `view`.
+        """
+        return _relit(self, projected(self, lights), view, materials)
 
     @abc.abstractmethod
     def at(self, points: Any) -> "System":
@@ -570,9 +584,36 @@ def radiance(
         return system.combine(system.shade(system.light(environment), materials), view)
     if not math.prod(batch):
         raise ValueError(f"a batch of lights must hold at least one, got {list(environment.radiance.shape)}")
-    lights = [Environment(light) for light in environment.radiance.reshape(-1, faces, rows, columns, colors)]
-    color = [system.combine(system.shade(system.light(light), materials), view) for light in lights]
-    return jnp.stack(color).reshape(*batch, *color[0].shape)
+    lights = environment.radiance.reshape(-1, faces, rows, columns, colors)
+    color = [system.under_lights(block, view, materials) for block in _blocks(lights, system.vertices)]
+    return jnp.concatenate(color).reshape(*batch, *color[0].shape[1:])
+
+
+def _blocks(lights: Float[Array, "l 6 n n c"], vertices: int) -> list[Float[Array, "_ 6 n n c"]]:
+    """Lights in blocks of about one length that memory holds at once."""
+    most = max(1, _ROOM // (_PER_VERTEX * max(1, vertices)))
+    return jnp.array_split(lights, -(-len(lights) // most))
+
+
+def projected(system: System, lights: Float[Array, "l 6 n n c"]) -> PyTree:
+    """The results of `light`, along a leading axis, where they depend on the environments alone; else these.
+
+    What depends on the vertices is larger than a processor's cache for many lights, and is computed for each in turn.
+    """
+    if system.shared_light is None:
+        return Environment(lights)
+    return jax.vmap(lambda radiance: system.light(Environment(radiance)))(lights)
+
+
+def arriving(system: System, light: PyTree, materials: PyTree) -> PyTree:
+    """The result of `shade` from one of `projected`."""
+    return system.shade(system.light(light) if isinstance(light, Environment) else light, materials)
+
+
+@eqx.filter_jit
+def _relit(system: System, light: PyTree, view: PyTree, materials: PyTree) -> Float[Array, "l v _"]:
+    with jax.default_matmul_precision("highest"):
+        return mapped(lambda row: system.combine(arriving(system, row, materials), view), light)
 
 
 def memory(system: System) -> int:

@@ -107,6 +107,21 @@ def test_radiance_is_differentiable_in_the_parameters(pair, light):
         assert float(jnp.sum(slopes[name])) == pytest.approx(float((ends[0] - ends[1]) / (2 * step)), rel=0.1)
 
 
+def test_vmap_over_materials_and_batches_of_lights_are_loops(pair, light, close):
+    kind, free, _ = pair
+
+    def color(scale, environment):
+        material = dataclasses.replace(kind.other, diffuse=scale * kind.other.diffuse)
+        return free.radiance(environment, eye=jnp.array([2.0, 2.0, 3.0]), materials={"ball": material})
+
+    scale, turned = jnp.array([0.5, 1.0]), jnp.roll(light.radiance, 3, 2)
+    of_materials = jax.vmap(color, (0, None))(scale, light)
+    of_lights = color(0.5, Environment(jnp.stack([light.radiance, turned])))
+    for number in (0, 1):
+        close(of_materials[number], color(scale[number], light), tolerance=2e-5)
+        close(of_lights[number], color(0.5, [light, Environment(turned)][number]), tolerance=2e-5)
+
+
 def test_what_was_not_precomputed_is_refused(pair, light):
     kind, free, _ = pair
     wrong = [

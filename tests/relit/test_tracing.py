@@ -160,6 +160,13 @@ def test_a_kept_view_gives_the_picture_of_every_light_and_of_the_closed_form(clo
     np.testing.assert_allclose(dark.reshape(-1, 3)[inside < -0.15], 0, atol=FAINT)
 
 
+def test_a_batch_of_lights_is_each_light_by_itself_with_rays_too(close):
+    batch = Environment(jnp.stack([light(1).radiance, light(2).radiance]))
+    colors = relit().radiance(batch, eye=EYE)
+    for number, seed in enumerate((1, 2)):
+        close(colors[number], relit().radiance(light(seed), eye=EYE), tolerance=1e-5)
+
+
 def test_light_is_linear_and_colors_have_the_gradient_of_finite_differences(close):
     ready, weight = relit(), np.random.default_rng(2).normal(size=(98, 3)).astype(np.float32)
     view = ready.view(EYE)

@@ -432,6 +432,44 @@ def test_a_batch_of_lights_is_each_light_by_itself(name, close):
     close(color[0, 1], color_of(case, light(4)))
 
 
+def some_materials(case: Case, seed: int) -> Any:
+    """Random materials of all vertices; none of scenes, whose parts have fixed BRDFs here."""
+    if isinstance(case.system, prt.RelitScene):
+        return None
+    weight = np.random.default_rng(seed).uniform(size=(case.system.vertices, 1, 3))
+    return prt.Blend(weight.astype(np.float32))
+
+
+@jax.jit
+def batched(system: prt.System, radiance: jax.Array, eyes: jax.Array, materials: Any) -> tuple[jax.Array, ...]:
+    """Radiance by `jax.vmap` over lights, over eyes and over materials, and gradients by a batch of lights."""
+
+    def one(radiance, eye, materials):
+        return prt.radiance(system, Environment(radiance), eye=eye, materials=materials)
+
+    arguments = [(radiance, EYE, None), (radiance[0], eyes, None), (radiance[0], EYE, materials)]
+    axes = [(0, None, None), (None, 0, None), (None, None, 0)]
+    pairs = list(zip(axes, arguments, strict=True))[: 2 if materials is None else 3]
+    slope = jax.grad(lambda lights: jnp.sum(one(lights, EYE, None) ** 2))(radiance)  # a batch of lights
+    return *(jax.vmap(one, axis)(*argument) for axis, argument in pairs), slope
+
+
+@each_system
+def test_vmap_over_lights_eyes_and_materials_is_a_loop(name, close):
+    case, lights, eyes = case_of(name), [light(3), light(4)], np.stack([EYE, [-2.0, 1.5, 1.0]]).astype(np.float32)
+    materials = [some_materials(case, seed) for seed in (0, 1)]
+    stacked = jax.tree.map(lambda *rows: jnp.stack(rows), *materials)
+    radiance = jnp.stack([environment.radiance for environment in lights])
+    of_lights, of_eyes, *of_materials, slope = batched(case.system, radiance, jnp.asarray(eyes), stacked)
+    for number in (0, 1):
+        close(of_lights[number], relit(case.system, lights[number], None), tolerance=2e-5)
+        close(of_eyes[number], prt.radiance(case.system, lights[0], eye=eyes[number]), tolerance=2e-5)
+        for color in of_materials:
+            close(color[number], relit(case.system, lights[0], materials[number]), tolerance=2e-5)
+        weight = 2 * np.asarray(of_lights[number])
+        close(slope[number], differentiated(case.system, radiance[number], EYE, None, weight)[1], tolerance=1e-4)
+
+
 @each_system
 def test_gradients_in_the_light_are_the_radiance_of_its_change(name, close):
     if not SYSTEMS[name].linear:

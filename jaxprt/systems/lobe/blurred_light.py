@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxprt import require
-from jaxprt.compile import kept
+from jaxprt.compile import kept, known, linear
 from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import cubemap
@@ -65,7 +65,13 @@ def prefilter(light: Environment) -> LobeLight:
         raise ValueError(
             f"the light must be one environment [6, n, n, c] with n of at least 8, got {list(light.radiance.shape)}"
         )
-    pyramid = _prefilter(light, _blurs(light.radiance))
+    blurs = _blurs(light.radiance)
+    # Batches are blurred in turn: all at once, what they read would leave the processor's cache.
+    pyramid = (
+        _prefilter(blurs, light.radiance)
+        if known(light)
+        else linear(_blurred, None, blurs, light.radiance, in_turn=True)
+    )
     return LobeLight(pyramid, diffuse.coefficients(light.radiance), light.radiance.shape[1])
 
 
@@ -86,11 +92,15 @@ def scales(size: int) -> Scales:
 
 
 @kept
-def _prefilter(light: Environment, blurs: list[tuple[Array, Array]]) -> Float[Array, "c t"]:
+def _prefilter(blurs: Sequence[tuple[Any, Any]], radiance: Float[Array, "6 n n c"]) -> Float[Array, "c t"]:
     """The light, blurred by lobes of all widths."""
-    _, size, _, colors = light.radiance.shape
+    return _blurred(blurs, radiance)
+
+
+def _blurred(blurs: Sequence[tuple[Any, Any]], radiance: Float[Array, "6 n n c"]) -> Float[Array, "c t"]:
+    _, size, _, colors = radiance.shape
     scale = scales(size)
-    mips = {size: light.radiance}
+    mips = {size: radiance}
     edge = size
     while edge > 4:
         edge //= 2
@@ -99,7 +109,7 @@ def _prefilter(light: Environment, blurs: list[tuple[Array, Array]]) -> Float[Ar
         mips[edge] = value / whole
     levels = []
     for number, edge in enumerate(scale.edge.tolist()):
-        value = light.radiance
+        value = radiance
         if number:
             index, weight = blurs[number - 1]
             source = mips[_edge(np.sqrt(scale.spread[number]), size, least=8)].reshape(-1, colors)
