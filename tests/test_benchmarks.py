@@ -47,6 +47,7 @@ MOST_ERROR = {
     "gradients": 1e-7,
     "interreflection": 0.7,
     "inverse": 0.16,  # of an exponent that pictures of 32 x 32 pixels determine to 6 %
+    "lights": 1e-5,  # A batch is its lights.
     "lobes": 0.15,
     "low_frequency": 0.06,  # of nine coefficients of irradiance
     "million": 1e-5,

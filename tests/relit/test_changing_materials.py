@@ -111,7 +111,7 @@ def test_vmap_over_materials_and_batches_of_lights_are_loops(pair, light, close)
     kind, free, _ = pair
 
     def color(scale, environment):
-        material = dataclasses.replace(kind.other, diffuse=scale * kind.other.diffuse)
+        material = dataclasses.replace(kind.first, diffuse=scale * kind.first.diffuse)
         return free.radiance(environment, eye=jnp.array([2.0, 2.0, 3.0]), materials={"ball": material})
 
     scale, turned = jnp.array([0.5, 1.0]), jnp.roll(light.radiance, 3, 2)
