@@ -288,9 +288,11 @@ class _Pair:
 
     def run(self, x: Array, *leaf: Array, back: bool) -> Array:
         fixed = self.tree.unflatten(leaf)
-        if back and self.backward is None:
+        if not back:
+            return self.forward(fixed, x)
+        if self.backward is None:
             return self.derived(x, *leaf, back=True)
-        return self.backward(fixed, x).astype(self.dtype) if back else self.forward(fixed, x)
+        return self.backward(fixed, x).astype(self.dtype)
 
     def derived(self, x: Array, *leaf: Array, back: bool) -> Array:
         """The same result, computed by the map only. Derivatives with respect to the leaves use it."""

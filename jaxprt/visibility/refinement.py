@@ -27,7 +27,7 @@ from jaxprt.visibility.diffuse import DiffuseTracer
 from jaxprt.visibility.occluder import Occluder, check
 from jaxprt.visibility.rays import PRECOMPUTE, first_fronts
 
-ALGORITHM = 1  # version of the division; raised by a release that divides otherwise
+ALGORITHM = 2  # version of the division; raised by a release that divides otherwise
 
 _DIRECTIONS = 1024  # per light: penumbrae have steps of a thousandth of its power
 _SIZE, _DEGREE = 8, 6  # texels along an edge and degree of harmonics, if no environments are given
