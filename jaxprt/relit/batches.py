@@ -157,7 +157,7 @@ def radiance(
     bounces: GroupBounces | None,
     lights: Float[Array, "l 6 n n c"],
     blends: Sequence[Blend | None],
-    lamp: Float[Array, "n 3"] | None,
+    lamp: Float[Array, "k 3"] | None,
     view: Any,
     order: Int[Array | np.ndarray, " v"],
 ) -> Float[Array, "l v c"]:
