@@ -5,7 +5,7 @@
 The scene is an object on a ground, 17,000 vertices together, with one metallic-roughness material or matte; the lights
 are one environment turned about the vertical. A call of `RelitScene.radiance` projects the lights, evaluates the view
 and combines both, for all vertices. `seconds` are processor seconds of a call with sixteen lights, `peer_seconds` those
-of one with a single light, and `times` their ratio: the issue is whether transport is read once for all lights. `error`
+of one with a single light, and `times` their ratio: which is low where transport is read once for all lights. `error`
 is the largest deviation of the batch from calls with single lights, relative to the largest radiance. `pixels` is
 `RelitScene.pictures` of one camera in place of the vertices.
 """
