@@ -67,7 +67,7 @@ def soft_box(direction: Any, degrees: float, dim: float, *, size: int) -> Enviro
 
     Args:
         direction: Direction towards the lamp.
-        degrees: Its angular radius.
+        degrees: Angle from the middle of the lamp to its edge.
         dim: Radiance of the light from everywhere.
         size: Texels along the edge of the light's faces.
 
@@ -158,6 +158,17 @@ def share(value: float) -> str:
     return f"{100 * value:.0f} %" if value >= 0.095 else f"{100 * value:.1f} %"
 
 
+def _judged(line: dict[str, Any], exact: Exact | None, name: str, picture: np.ndarray, where: np.ndarray) -> str:
+    """Adds the errors of a picture to its line, over some pixels and over all, and returns the end of its caption.
+
+    Without Mitsuba's picture, and of that itself, there are none.
+    """
+    if exact is None or name.startswith("Mitsuba"):
+        return ""
+    line |= {"error": exact.off(picture, where), "error_whole": exact.off(picture)}
+    return f", {share(line['error'])} off"
+
+
 class Layers(NamedTuple):
     """A picture and what it is made of, by pixel.
 
@@ -166,7 +177,7 @@ class Layers(NamedTuple):
         direct: Direct light alone, with coverage.
         normal: Unit normals, where a surface covers the pixel.
         position: Where that surface is.
-        part: Its part, -1 for none.
+        part: Number of the part that covers the pixel; -1 where none does.
     """
 
     color: np.ndarray
@@ -338,9 +349,7 @@ class Figures:
             red, _, blue = np.mean(picture[chest][:, :3], 0)
             line = {"picture": name, "chest": mean(picture, chest), "blue_over_red": float(blue / red)}
             caption = f"{name}\nchest: {line['chest']:.3f}, blue {line['blue_over_red']:.2f} of red"
-            if exact is not None and not name.startswith("Mitsuba"):
-                line |= {"error": exact.off(picture, chest), "error_whole": exact.off(picture)}
-                caption += f", {share(line['error'])} off"
+            caption += _judged(line, exact, name, picture, chest)
             pictures[caption] = picture
             lines.append(line)
         return Sheet(pictures, lines)
@@ -437,9 +446,7 @@ class Figures:
             caption = f"{name}\nsides away from the light: {line['away']:.4f}"
             if picture is not drawn.direct:
                 caption += f", {line['brighter']:.1f} times"
-            if exact is not None and not name.startswith("Mitsuba"):
-                line |= {"error": exact.off(picture, away), "error_whole": exact.off(picture)}
-                caption += f", {share(line['error'])} off"
+            caption += _judged(line, exact, name, picture, away)
             pictures[caption] = picture
             lines.append(line)
         return Sheet(pictures, lines)

@@ -37,7 +37,7 @@ class Quoted(NamedTuple):
     Attributes:
         page: The page, relative to the repository.
         figure: The numbers and their unit, such as "11 to 14 s".
-        place: Its number among equal figures of the page, from 1.
+        place: Counts equal figures of the page, from 1.
     """
 
     page: str
@@ -65,7 +65,7 @@ def quotes(page: str, text: str) -> list[Quoted]:
 
     Args:
         page: Name of the page.
-        text: Its Markdown.
+        text: The Markdown of the page.
     """
     plain = re.sub(r"`[^`\n]*`", "", _CODE.sub("", text))
     counts = collections.Counter[str]()

@@ -39,13 +39,8 @@ _STAGES = {
     "bounce 2": "tracing the second bounce",
 }
 # Parts of the time that stages take, roughly: those before the rays of a system, and after them.
-_PREVIEW, _DIVISION, _RAYS, _REFLECTION, _COMPILING = (
-    0.05,
-    0.3,
-    1.0,
-    (("response", 0.1), ("patches", 0.2), ("bounce", 0.3)),
-    0.3,
-)
+_PREVIEW, _DIVISION, _RAYS, _COMPILING = 0.05, 0.3, 1.0, 0.3
+_REFLECTION = (("response", 0.1), ("patches", 0.2), ("bounce", 0.3))
 
 
 @click.command(cls=options.Command, short_help="Show a scene in the interactive viewer in a browser.")

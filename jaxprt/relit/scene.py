@@ -591,7 +591,7 @@ class RelitScene(System):
     ) -> PictureView:
         """All of a picture that does not depend on the light: `picture_view(camera).picture(environment)` renders it.
 
-        It is faster than `picture` for many environments, and stores about a kilobyte for each shaded point.
+        It is faster for many lights, and stores about a kilobyte for each shaded point. `picture` gives the errors.
 
         Args:
             camera: As for `picture`.

@@ -29,9 +29,8 @@ _FACE = 300  # bytes of a triangle and its share of vertices, in the scene and w
 # Corners that a file has at one place differ by rounding in float32. Transforming them sums four products, each rounded
 # twice, on either side of the joint: at most 8 steps of 2^-23 times the largest coordinate.
 _ROUNDING = 2.0**-20
-_SLIVER = (
-    2.0**-10
-)  # no two corners of a triangle are one place, unless its shortest edge is below this share of its longest
+# No two corners of a triangle are one place, unless its shortest edge is below this share of its longest.
+_SLIVER = 2.0**-10
 _CANCELED = 1e-6  # two unit normals cancel if their mean is shorter than this
 
 # Triangles that replace a triangle, by which of its edges are cut, counted from the longest edge. Corners are 0 to 2,
