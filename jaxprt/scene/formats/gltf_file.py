@@ -468,8 +468,13 @@ class Document(Header):
     def _chunks(self, content: bytes) -> tuple[bytes, bytes | None]:
         """The header and the binary chunk of a GLB (section 4)."""
         must = "must be an undamaged GLB file"
-        if len(content) < 20 or content[:4] != b"glTF":
-            raise self.error(f"{must}, which starts with b'glTF'", f"{len(content)} bytes that start {content[:4]!r}")
+        if content[:4] != b"glTF":
+            raise self.error(
+                f"{must}, which starts with the text glTF",
+                f"the bytes {content[:4].hex(' ')}" if content else "an empty file",
+            )
+        if len(content) < 20:
+            raise self.error(f"{must} of at least 20 bytes, its two headers", f"{len(content)}")
         version, length, size, kind = struct.unpack_from("<4I", content, 4)
         if version != 2:
             raise self.error(f"{must} of version 2", f"version {version}")
