@@ -548,10 +548,10 @@ def test_files_that_are_cut_off_or_something_else_are_refused(tmp_path):
         with pytest.raises(ValueError, match=r"broken\.glb must be an undamaged GLB file"):
             load_scene(path)
     path.write_bytes(content[:9])
-    with pytest.raises(ValueError, match="of at least 20 bytes, its two headers, got 9$"):
+    with pytest.raises(ValueError, match=r"of at least 20 bytes, its two headers, got 9$"):
         load_scene(path)
     path.write_bytes(b"glTX" + content[4:])
-    with pytest.raises(ValueError, match="which starts with the text glTF, got the bytes 67 6c 54 58$"):
+    with pytest.raises(ValueError, match=r"which starts with the text glTF, got the bytes 67 6c 54 58$"):
         load_scene(path)
     with pytest.raises(FileNotFoundError, match=r"absent\.glb must be a glTF file, and there is no such file"):
         load_scene(tmp_path / "absent.glb")
