@@ -17,6 +17,7 @@ from jaxprt.relit.channels import Shading
 from jaxprt.scene import Environment, Part, TexturedMaterial, material_table
 from jaxprt.scene.material import Texture
 from jaxprt.scene.material_table import MaterialTable
+from jaxprt.scene.texture import unit_normals
 from jaxprt.sphere import cubemap
 from jaxprt.systems import standard
 from jaxprt.systems.lobe import blurred_light
@@ -29,7 +30,8 @@ _STARTS = ("first", "weightStart", "pyramidStart", "visibleStart", "arrivedStart
 _TERMS = {standard.BLINN_PHONG: [3, 4], standard.COOK_TORRANCE: [3, 5, 6]}
 _LIGHT = 32  # most texels along the edge of the faces of the light that lobes read without visibility
 _IMAGE = 512  # most texels along an edge of an image
-_IMAGES = ("base_color", "roughness", "metallic")  # textures that pages read at pixels
+_IMAGES = ("base_color", "roughness", "metallic", "emissive", "normal")  # textures that pages read at pixels
+_COLORED = ("base_color", "emissive")  # of these, those that are encoded by sRGB
 _SKY = 64  # most texels along the edge of a light's faces
 
 
@@ -70,14 +72,16 @@ def scene_content(page: PageScene) -> tuple[dict[str, Any], list[bytes]]:
     terms = max(-(-len(unit) // 4) * 4, 4)
     place: dict[str, int] = dict.fromkeys(_STARTS, 0)
     tables, images, materials = _Tables(), _Images(), material_table.of_parts(page.scene.parts)
-    normals = _normals(page, materials)
     parts, scale = [], page.scales
     stride = 0 if scale is None else int(scale.total - scale.start[page.level])
     arrays: list[list[np.ndarray]] = [[] for _ in range(6)]
-    rows = zip(page.scene.parts, page.shading, page.parts, bits, normals, strict=True)
+    tilted, mapped = _tilted_normals(page, materials), False
+    rows = zip(page.scene.parts, page.shading, page.parts, bits, tilted, strict=True)
     for part, shading, held, bit, direction in rows:
         start, table = tables.add(f"part {part.name!r}", held)
         weight, seen, described = _weights(shading, held), held.means, _material_json(part, shading, images)
+        if described and "normal" in described.get("textures", {}):
+            direction, mapped = shading.mesh.normal, True
         count = held.vector.shape[1]
         about = held.description | {"family": _family(shading), "texels": bool(bit.size) or bool(page.unshadowed)}
         about |= {"name": part.name, "count": count, "channels": weight.shape[1] - 1}
@@ -102,8 +106,11 @@ def scene_content(page: PageScene) -> tuple[dict[str, Any], list[bytes]]:
     content |= {"texelEdge": edge, "texels": texels_of(edge) if edge else 0, "visibility": not page.unshadowed}
     joined = [np.concatenate(column) for column in arrays]
     joined.insert(3, tables.joined())
-    coordinate = np.asarray(materials.coordinate)[: place["first"]] if images.described else np.zeros((0, 4))
-    joined += [coordinate.astype("<f4"), *images.data]
+    count = place["first"]
+    coordinate = np.asarray(materials.coordinate)[:count] if images.described else np.zeros((0, 4))
+    tangent = np.asarray(materials.frame)[:count, 3:7] if mapped else np.zeros((0, 4))
+    tangent = np.round(127 * np.clip(tangent, -1, 1)).astype("i1")
+    joined += [coordinate.astype("<f4"), tangent.reshape(-1), *images.data]
     content["images"] = images.described
     joined[2] = np.append(joined[2], np.zeros(4 - len(joined[2]) % 4, np.uint8))  # whole words
     added, reflected = _reflected(page)
@@ -123,7 +130,7 @@ def _reflected(page: PageScene) -> tuple[dict[str, Any], Int8[np.ndarray, " n"]]
     return {"reflectedUnit": unit.tolist()}, np.concatenate(columns)
 
 
-def _normals(page: PageScene, materials: MaterialTable) -> list[Float[np.ndarray, "v 3"]]:
+def _tilted_normals(page: PageScene, materials: MaterialTable) -> list[Float[np.ndarray, "v 3"]]:
     """Normals at the vertices of each part, with those of normal maps."""
     tilted = materials.at_vertices().normal
     if tilted is None:
@@ -160,20 +167,22 @@ class _Images:
 
     Attributes:
         described: Size and number of channels of each image.
-        data: Bytes of each image, first row on top; colors are encoded by sRGB.
+        data: Bytes of each image, first row on top; colors are encoded by sRGB. Normals are 127 (normal + 1), so that
+            their zeros and ones are exact.
     """
 
     def __init__(self):
         """Starts without images."""
         self.described: list[dict[str, int]] = []
         self.data: list[np.ndarray] = []
-        self._number: dict[tuple[int, bool], int] = {}
+        self._number: dict[tuple[int, str], int] = {}
 
-    def add(self, texture: Texture, *, colored: bool) -> dict[str, Any]:
+    def add(self, texture: Texture, name: str) -> dict[str, Any]:
         """How a texture reads its image, which is added where it is new."""
-        key = id(texture.image), colored
+        colored, normal = name in _COLORED, name == "normal"
+        key = id(texture.image), "color" if colored else "normal" if normal else "value"
         if key not in self._number:
-            value = np.asarray(texture.image, np.float64)
+            value = np.asarray(unit_normals(texture.image) if normal else texture.image, np.float64)
             while max(value.shape[:2]) > _IMAGE and not (value.shape[0] % 2 or value.shape[1] % 2):
                 value = value.reshape(value.shape[0] // 2, 2, value.shape[1] // 2, 2, -1).mean((1, 3))
             value = np.clip(value, 0, 1)
@@ -183,7 +192,7 @@ class _Images:
             height, width, channels = value.shape
             self._number[key] = len(self.data)
             self.described.append({"width": width, "height": height, "channels": channels})
-            self.data.append(np.round(255 * value).astype(np.uint8))
+            self.data.append(np.round((254 if normal else 255) * value).astype(np.uint8))
         how = {"transform": np.asarray(texture.transform, float).tolist(), "set": texture.set, "wrap": texture.wrap}
         return {"image": self._number[key], **how}
 
@@ -270,15 +279,15 @@ def _material_json(part: Part, shading: Shading, images: _Images) -> dict[str, A
         return {"material": _colors(material, "diffuse", "specular", "f0") | {"slope": float(material.roughness)}}
     if not isinstance(material, TexturedMaterial) or shading.scale is None or part.color is not None:
         return None
-    names = ("base_color", "metallic", "specular", "specular_color", "ior", "roughness")
+    names = ("base_color", "metallic", "specular", "specular_color", "ior", "roughness", "emissive", "normal_scale")
     values: dict[str, Any] = {name: np.asarray(getattr(material, name), float).tolist() for name in names}
     fields = {
         field.name.removesuffix("_texture"): getattr(material, field.name) for field in dataclasses.fields(material)
     }
     textures = {name: value for name, value in fields.items() if isinstance(value, Texture)}
-    if set(textures) - {*_IMAGES, "normal", "alpha"}:
+    if set(textures) - {*_IMAGES, "alpha"}:
         return None
-    read = {name: images.add(textures[name], colored=name == "base_color") for name in _IMAGES if name in textures}
+    read = {name: images.add(textures[name], name) for name in _IMAGES if name in textures}
     return {"material": values, "textures": read}
 
 

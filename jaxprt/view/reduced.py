@@ -103,13 +103,11 @@ class PageScene:
 
     @classmethod
     def for_gpu(cls, relit: RelitScene) -> "PageScene":
-        """All that a page can show of a scene, as finely as graphics cards hold it.
+        """All that a page can show of a scene without bounces, as finely as graphics cards hold it.
 
         Raises:
-            ValueError: A page cannot show the system of a part, or the light of lamps.
+            ValueError: A page cannot show the system or the layers of a part.
         """
-        if relit.lamps is not None:
-            raise ValueError("the scene has lamps of its own")
         if layered := [name for name, row in zip(relit.scene.names, relit.shading, strict=True) if row.layered]:
             raise ValueError(f"these parts have clear coats or sheens: {', '.join(map(repr, layered))}")
         page = cls.of(relit.without_bounces())
@@ -144,8 +142,11 @@ class PageScene:
         """The scene with only some of what bounces and lamps add; the form of the arrays stays."""
         if self.reflected is None:
             return self
-        keep = np.array([*[bounces] * (exported.ROWS - 1), lamps], float)[:, None, None]
-        added = [rows * keep[: len(rows)] for rows in self.reflected]
+        added = []
+        for rows in self.reflected:
+            keep = np.full(len(rows), float(bounces))
+            keep[-1:] = lamps
+            added.append(rows * keep[:, None, None])
         return dataclasses.replace(self, reflected=added)
 
     def relit(self) -> RelitScene:

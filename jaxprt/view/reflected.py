@@ -19,12 +19,14 @@ _ARRIVING = 3  # degree of the light that arrives from other surfaces
 def transfer(relit: RelitScene) -> list[Float[np.ndarray, "k 3 _"]] | None:
     """Irradiance / pi that bounces and lamps add at the vertices of each part; None for a scene without both.
 
-    Rows are those of environments of one harmonic, without lamps; the last row is that of the lamps alone.
+    Rows are those of environments of one harmonic, without lamps; the last row is that of the lamps alone, and the only
+    one of a scene without bounces.
     """
     if relit.bounces is None and relit.lamps is None:
         return None
     basis = harmonics.evaluate(cubemap.direction(size=_EDGE), degree=DEGREE)
-    rows = [_reflected(relit, Environment(basis[..., k, None]), None) for k in range(ROWS - 1)]
+    count = 0 if relit.bounces is None else ROWS - 1
+    rows = [_reflected(relit, Environment(basis[..., k, None]), None) for k in range(count)]
     looks = [Appearance(shading.blend, shading.emitted) for shading in relit.shading]
     lamp = None if relit.lamps is None else relit.lamps.radiance(looks, {})
     last = _reflected(relit, Environment(jnp.zeros_like(basis[..., :1])), lamp)

@@ -132,7 +132,27 @@ def textured():
     return TexturedMaterial(base_color=(0.9, 0.8, 0.7), metallic=0.3, roughness=0.8, **images)
 
 
+def bumps(amplitude):
+    """A normal map of waves along both axes."""
+    wave = amplitude * np.sin(2 * np.pi * np.arange(16) / 16)
+    slope = np.stack(np.broadcast_arrays(wave[None], wave[:, None], np.ones((16, 16))), -1)
+    return Texture((slope / np.linalg.norm(slope, axis=-1, keepdims=True) + 1) / 2)
+
+
+def mapped(**parameters):
+    """A material with a normal map, whose image of emission no other texture shares."""
+    glow = Texture(np.random.default_rng(4).uniform(0, 1, (8, 8, 3)))
+    return TexturedMaterial(
+        normal_texture=bumps(0.5), normal_scale=0.8, emissive=(0.5, 0.2, 0.8), emissive_texture=glow, **parameters
+    )
+
+
 CASES = {
+    "normal map": (
+        mapped(base_color=(0.9, 0.7, 0.3), metallic=1.0, roughness=0.4),
+        MATTE,
+        prt.relit.Lobes(8, texels=2),
+    ),
     "textured": (textured(), MATTE, prt.relit.Lobes(8, texels=2)),
     "glossy": (GLOSSY, MATTE, prt.relit.Lobes(8, texels=2)),
     "matte": (MATTE, MATTE, prt.relit.Lobes(8, texels=2)),
@@ -154,6 +174,21 @@ def test_pixels_of_the_browser_are_those_of_python(case, shaded):
     assert np.mean(same) > 0.3
     off = np.abs(found[..., :3] - true)[same]
     assert off.mean() < SAME * true[same].mean()
+
+
+def test_diffuse_light_follows_normal_maps(shaded):
+    material = TexturedMaterial(base_color=0.8, metallic=0.0, roughness=1.0, normal_texture=bumps(0.6))
+    scene = scene_of(material, MATTE)
+    options = {"refine": False, "system": prt.relit.Lobes(8, texels=0), "size": SIZE, "progress": False}
+    relit = prt.precompute(scene, **options)
+    found = shaded(PageScene.for_gpu(relit), relit.mesh, [light()], CAMERA)
+    true = np.asarray(relit.picture(light(), CAMERA, samples=1, shadows="vertices"))
+    ball = np.asarray(relit.picture(light(), CAMERA, samples=1, layers=("part",))["part"]) == 0
+    same = inside(ball) & inside(found[..., 3] == 1)
+    off = np.abs(found[..., :3] - true)[same].mean() / true[same].mean()
+    smooth = scene_of(dataclasses.replace(material, normal_texture=None), MATTE)
+    flat = np.asarray(prt.precompute(smooth, **options).picture(light(), CAMERA, samples=1, shadows="vertices"))
+    assert off < 0.5 * np.abs(flat - true)[same].mean() / true[same].mean()
 
 
 @pytest.mark.parametrize("material", [GLOSSY, METAL, MATTE])
@@ -251,7 +286,7 @@ def test_why_a_scene_is_not_shaded_by_the_gpu_is_said(systems, lights, look):
     )
     session = Session({"lobes": bare, "others": others}, environments=lights)
     content, buffers = session.answer({"kind": "page", "system": "lobes"})
-    assert (content["kind"], content["visibility"], len(buffers)) == ("page", True, 9 + len(content["rims"]) + 2)
+    assert (content["kind"], content["visibility"], len(buffers)) == ("page", True, 10 + len(content["rims"]) + 2)
     content, buffers = session.answer({"kind": "page", "system": "others"})
     assert "part 'ball' must have the transfer matrices of direct light" in content["missing"]
     assert not buffers

@@ -39,7 +39,7 @@ class ReflectingSystem(VertexSystem):
     Attributes:
         direct: The system of direct light: lobes or ideally diffuse, with or without single texels.
         vector: Irradiance / pi at the vertices v in each color: a row for each harmonic of the environment up to
-            `DEGREE`, and the last one for the light of lamps.
+            `DEGREE`, or none without bounces, and the last one for the light of lamps.
     """
 
     direct: System
@@ -48,7 +48,7 @@ class ReflectingSystem(VertexSystem):
     def light(self, environment: Environment) -> ReflectingLight:
         """The light of the system of direct light, and the irradiance of reflected light."""
         coefficient = harmonics.project(environment.radiance, degree=DEGREE)
-        coefficient = jnp.broadcast_to(coefficient, (len(coefficient), 3))
+        coefficient = jnp.broadcast_to(coefficient, (len(coefficient), 3))[: len(self.vector) - 1]
         irradiance = jnp.einsum("kc,kcv->cv", coefficient, self.vector[:-1], precision="highest") + self.vector[-1]
         return ReflectingLight(self.direct.light(environment), irradiance)
 

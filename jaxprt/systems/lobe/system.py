@@ -34,6 +34,8 @@ from jaxprt.systems.protocol import Blend
 _LEAST = 1e-3  # smallest visibility by which the shift of a lobe is divided
 _FARTHEST = 2.5  # largest shift of the mean of the visible part, in standard deviations
 _TINY = 1e-12
+_FLANK = 0.55  # spread of a lobe whose flanks, at 45 degrees, are as steep as those of a cosine
+_DARK, _BRIGHTEST = 1e-6, 4.0  # least light that tilted normals are compared with, and largest ratio to it
 
 
 class LobeView(eqx.Module):
@@ -171,6 +173,19 @@ class CoarseLobes(LobeSystem):
         light = super().light(Environment(radiance))
         return dataclasses.replace(light, coefficient=harmonic.project(environment, degree=DEGREE))
 
+    def tilted(self, light: LobeLight, normal: Float[Array, "v 3"]) -> LobeLight:
+        """The light as it is: what arrives at tilted normals changes as it would without shadows, in `combine`."""
+        return light
+
+    def combine(self, light: LobeLight, view: LobeView) -> Float[Array, "v c"]:
+        """Radiance: `LobeSystem.combine`."""
+        if view.points is None or view.points.normal is None:
+            return super().combine(light, view)
+        smooth = view.points.tilted(None).frame(self.transport.frame)[:, 2]
+        before, after = (_upon(light, normal) for normal in (smooth.T, view.points.normal))
+        share = jnp.minimum(after / jnp.maximum(before, _DARK), _BRIGHTEST)
+        return super().combine(light, dataclasses.replace(view, diffuse=view.diffuse * share))
+
 
 def _brdf(value: Any) -> None:
     require.kind("the BRDF", value, LobeBrdf, source="jaxprt.lobe.tabulate")
@@ -236,16 +251,29 @@ def _places(
 def _taps(face, s, t, spread, concentration, visible, *, size: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
     """Texels of the blurred light that each lobe reads, and their weights."""
     seen, face, s, t, spread = _seen_part(visible, face, s, t, spread, concentration)
-    scale = scales(size)
+    place, weight = zip(*_blurred(face, s, t, spread, size=size), strict=True)
+    return place, tuple(seen * part for part in weight)
+
+
+def _blurred(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> list[tuple[Array, Array]]:
+    """Texels of the light that is blurred by a spread, and their weights, which sum to 1."""
+    scale, result = scales(size), []
     number, upper = between(scale, spread)
-    place, result = [], []
     for step, part in ((0, 1 - upper), (1, upper)):
         edge, start = (jnp.asarray(x)[number + step] for x in (scale.edge, scale.start))
         row, column, weights = corners(edge, s, t)
         for (down, right), (value, _, _) in weights:
-            place.append(start + (face * (edge + 2) + row + down) * (edge + 2) + column + right)
-            result.append(seen * value * part)
-    return tuple(place), tuple(result)
+            place = start + (face * (edge + 2) + row + down) * (edge + 2) + column + right
+            result.append((place, value * part))
+    return result
+
+
+@isolated
+def _upon(light: LobeLight, normal: Float[Array, "3 p"]) -> Float[Array, "c p"]:
+    """What changes with the normal about as irradiance does without shadows: the light, widely blurred."""
+    face, s, t = cubemap.project(*normal)
+    taps = _blurred(face, s, t, jnp.full_like(s, _FLANK), size=light.size)
+    return reduce(jnp.add, (light.pyramid[:, texel] * part for texel, part in taps))
 
 
 def _seen_part(visible, face, s, t, spread, concentration) -> tuple[Array, Array, Array, Array, Array]:

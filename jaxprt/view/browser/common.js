@@ -56,3 +56,6 @@ export function half(bits) {
   const exponent = (bits >> 10) & 31, fraction = bits & 1023;
   return exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : 2 ** -14 * (fraction / 1024);
 }
+
+// Whether a context can draw into textures of floats.
+export function floats(gl) { return gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"); }

@@ -2,12 +2,13 @@
 // Diffuse light by transfer vectors; glossy light by lobes and means of visibility, as the lobe system does, or by transfer
 // matrices, as the harmonic system does: harmonics of the visibility are kept, and a light is taken through them once.
 
-import { pause } from "./common.js";
+import { floats, pause } from "./common.js";
 import { ARRIVE, GATHER, SHADE, SIGHT, WHOLE, WIDTH } from "./shading.js";
 import { gathered, harmonics } from "./harmonics.js";
 import { Blur, SIDES, grid, halved, readHdr, rimmed, toCubemap, toHalf, toSky, whole } from "./lights.js";
 
-const TEXTURES = ["base_color", "roughness", "metallic"]; // that are read at pixels
+const TEXTURES = ["base_color", "roughness", "metallic", "emissive", "normal"]; // that are read at pixels
+const COLORS = ["base_color", "emissive"]; // of these, those in sRGB
 const SLICE = 8; // milliseconds of computing, after which the page may draw a frame
 const FINE = 4; // parts along the edge of a texel by which the rim of a lamp is found
 
@@ -25,6 +26,7 @@ export class Piece {
     this.visible = next(Int8Array);
     this.bits = next(Uint8Array);
     this.coordinates = next(Float32Array);
+    this.tangents = next(Int8Array);
     this.images = content.images.map(() => next(Uint8Array));
     this.reflected = next(Int8Array);
     this.index = new Map(content.rims.map((edge) => [edge, next(Uint32Array)]));
@@ -46,6 +48,10 @@ export class Piece {
     for (let i = 0; i < this.count; i++) for (let c = 0; c < 3; c++) {
       place[8 * i + c] = this.position[3 * i + c];
       place[8 * i + 4 + c] = this.normal[3 * i + c] / 32767;
+    }
+    for (let i = 0; 4 * i < this.tangents.length; i++) { // and the handedness as sign: WebGL2 has no more than 16 textures
+      const [x, y, z, hand] = this.tangents.subarray(4 * i, 4 * i + 4);
+      place[8 * i + 3] = Math.sign(hand) * (1 + (x + 127) + 255 * (y + 127) + 255 ** 2 * (z + 127));
     }
     this.texture("faces", gl.RGB32UI, gl.RGB_INTEGER, gl.UNSIGNED_INT, this.face, 3);
     const words = (bytes) => new Uint32Array(bytes.buffer, bytes.byteOffset, bytes.length / 4), none = new Float32Array(8);
@@ -96,13 +102,15 @@ export class Piece {
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, handle);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-    if (channels === 3) {
+    if (name === "normal") gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, width, height, 0, gl.RGBA, gl.FLOAT, normals(data));
+    else if (channels === 3) {
       const colors = new Uint8Array(4 * width * height);
       for (let i = 0, to = 0; i < data.length; i += 3, to += 4) [colors[to], colors[to + 1], colors[to + 2], colors[to + 3]] = [data[i], data[i + 1], data[i + 2], 255];
-      gl.texImage2D(gl.TEXTURE_2D, 0, name === TEXTURES[0] ? gl.SRGB8_ALPHA8 : gl.RGBA8, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, colors);
+      gl.texImage2D(gl.TEXTURE_2D, 0, COLORS.includes(name) ? gl.SRGB8_ALPHA8 : gl.RGBA8, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, colors);
     } else gl.texImage2D(gl.TEXTURE_2D, 0, gl.R8, width, height, 0, gl.RED, gl.UNSIGNED_BYTE, data);
-    gl.generateMipmap(gl.TEXTURE_2D);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+    const levels = name !== "normal" || floats(gl);
+    if (levels) gl.generateMipmap(gl.TEXTURE_2D);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, levels ? gl.LINEAR_MIPMAP_LINEAR : gl.LINEAR);
     const many = gl.getExtension("EXT_texture_filter_anisotropic");
     if (many) gl.texParameterf(gl.TEXTURE_2D, many.TEXTURE_MAX_ANISOTROPY_EXT, Math.min(8, gl.getParameter(many.MAX_TEXTURE_MAX_ANISOTROPY_EXT)));
     [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T].forEach((side, i) => gl.texParameteri(gl.TEXTURE_2D, side, { repeat: gl.REPEAT, mirror: gl.MIRRORED_REPEAT, clamp: gl.CLAMP_TO_EDGE }[wrap[i]]));
@@ -313,8 +321,10 @@ export class Piece {
   sample(program, part, factors) {
     const { gl } = this, at = (name) => this.at(name, program);
     const found = part.samplers.map((handle, i) => (handle ? 1 << i : 0));
-    gl.uniform1i(at("sampled"), found[0] + found[1] + found[2]);
+    gl.uniform1i(at("sampled"), found.reduce((a, b) => a + b));
     if (!found.some(Boolean)) return;
+    gl.uniform3fv(at("emissive"), part.material.emissive);
+    gl.uniform1f(at("slope"), part.material.normal_scale);
     gl.uniform3fv(at("baseColor"), factors.base);
     gl.uniform3fv(at("f0"), factors.f0);
     gl.uniform4f(at("factors"), factors.specular, factors.metallic, factors.roughness, 0);
@@ -435,6 +445,16 @@ async function means(content, bits, index) {
         result[to + (face * m + row) * m + column] = (255 * (at(up, left) + at(up, column) + at(row, left))) / 3 + 0.5;
       }
     });
+  }
+  return result;
+}
+
+// The normals of a map, whose lengths matter where they are means. Lengths that are off one by less than bytes tell are one.
+function normals(data) {
+  const result = new Float32Array((data.length / 3) * 4);
+  for (let i = 0, to = 0; i < data.length; i += 3, to += 4) {
+    const way = [0, 1, 2].map((c) => data[i + c] / 127 - 1), length = Math.hypot(...way), scale = length > 0.99 ? 1 / length : 1;
+    for (let c = 0; c < 3; c++) result[to + c] = scale * way[c];
   }
   return result;
 }

@@ -1,6 +1,6 @@
 // Shades the pixels of a picture on the GPU: first which triangle each pixel shows, then its light, part by part.
 
-import { clamp } from "./common.js";
+import { clamp, floats } from "./common.js";
 import { WHOLE, WIDTH } from "./shading.js";
 
 const RASTER = `#version 300 es
@@ -52,7 +52,7 @@ export class Pixels {
       gl.useProgram(program);
       gl.uniform1i(piece.at("shown", program), this.unit);
     }
-    this.floats = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
+    this.floats = floats(gl);
     this.images = {};
     this.triangles = null;
     this.fence = null;

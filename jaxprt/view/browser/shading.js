@@ -34,13 +34,14 @@ uniform int first, count, lobes, channels, nodes, knots, tableStart, weightStart
 uniform float knot[KNOTS], scale[4], logRoughness, steps;
 uniform int edges[LEVELS], starts[LEVELS], lightEdges[WIDTHS], lightStarts[WIDTHS];
 uniform float spreads[LEVELS], lightSpreads[WIDTHS];
-uniform sampler2D coordinates, base_colorImage, roughnessImage, metallicImage;
-uniform int sampled, sets[3]; // which textures there are, and the coordinates and transform of each
-uniform vec3 across[3], upward[3], baseColor, f0; uniform vec4 factors; // specular, metallic, roughness
+uniform sampler2D coordinates, base_colorImage, roughnessImage, metallicImage, emissiveImage, normalImage;
+uniform int sampled, sets[5]; // which textures there are, and the coordinates and transform of each
+uniform vec3 across[5], upward[5], baseColor, f0, emissive; uniform vec4 factors; // specular, metallic, roughness
+uniform float slope; // of the normal map
 ${AT} ${CUBE} ${BRIGHT}
 int corner[CORNERS]; // vertices of the part, and how much each counts
 float share[CORNERS];
-vec3 position, normal;
+vec3 position, normal, smooth_; // normals with that of a map, and without
 
 float drop(float k) { return k < 1e-2 ? 1. - k / 3. : 1. / k - 2. / (exp(min(2. * k, 80.)) - 1.); }
 
@@ -150,7 +151,8 @@ vec3 diffuseLight() {
 #if SHADOWS
   vec3 result = vec3(0);
   for (int k = 0; k < CORNERS; k++) result += share[k] * uintBitsToFloat(texelFetch(arriving, at(first + corner[k]), 0).rgb);
-  return result;
+  if (lobes == 0 || normal == smooth_) return result; // without lobes no blurred light is there
+  return result * min(radiance(normal, .55) / max(radiance(smooth_, .55), vec3(1e-6)), vec3(4)); // see CoarseLobes.combine in jaxprt/systems/lobe/system.py
 #else
   return radiance(normal, 1. / 3.); // of a cosine 1 - cos is a third on average
 #endif
@@ -254,7 +256,32 @@ vec4 read(sampler2D image, int which) {
   vec2 place = placed(coordinate, which, 1.);
   return CORNERS == 1 ? textureLod(image, place, 0.) : textureGrad(image, place, placed(toRight, which, 0.), placed(toTop, which, 0.));
 }
+vec4 tangentAt(int vertex) { // of the texture's coordinates, with their handedness
+  float both = texelFetch(place, at(2 * vertex), 0).w;
+  int code = int(abs(both)) - 1;
+  return vec4(code % 255 - 127, code / 255 % 255 - 127, code / 65025 - 127, sign(both));
+}
+// The normal that a map has in the frame of the surface, and log roughness, wider by how far the normals of a pixel are apart: see jaxprt/scene/texture.py.
+void tilt(inout float rough) {
+  vec4 tangent = vec4(0);
+  for (int k = 0; k < CORNERS; k++) tangent += share[k] * tangentAt(first + corner[k]);
+  vec3 along = tangent.xyz - normal * dot(tangent.xyz, normal), mean = read(normalImage, 4).xyz;
+  if (dot(along, along) < 1e-6) return;
+  along = normalize(along);
+  vec2 side = mean.xy * slope;
+  if (tangent.w < 0.) side.y = -side.y;
+  float off = length(side), height = max(mean.z, .1 * off);
+  if (off < 1e-3 && height < 1e-3) height = 1.;
+  normal = normalize(along * side.x + cross(normal, along) * side.y + normal * height);
+#if CORNERS == 3
+  vec2 size = vec2(textureSize(normalImage, 0)), x = placed(toRight, 4, 0.) * size, y = placed(toTop, 4, 0.) * size;
+  float square = clamp(dot(mean, mean), 1e-4, 1.), texels = min(.41 * max(dot(x, x), dot(y, y)), 1.);
+  float variance = (1. - square) / (sqrt(square) * (3. - square)) * slope * slope * texels;
+  rough = min(log(exp(4. * rough) + 2. * variance) / 4., max(rough, 0.));
+#endif
+}
 vec3 shade() {
+  smooth_ = normal;
   vec4 leading = weightAt(0);
   vec3 w[4], color = weightAt(channels).rgb;
   for (int k = 0; k < 4; k++) w[k] = k < channels ? (k == 0 ? leading.rgb : weightAt(k).rgb) : vec3(0);
@@ -270,6 +297,8 @@ vec3 shade() {
     vec3 base = (sampled & 1) > 0 ? baseColor * read(base_colorImage, 0).rgb : baseColor;
     float metal = (sampled & 4) > 0 ? factors.y * read(metallicImage, 2).r : factors.y, dielectric = 1. - metal, layer = dielectric * factors.x;
     rough = log(max((sampled & 2) > 0 ? factors.z * read(roughnessImage, 1).r : factors.z, .0316227766));
+    if ((sampled & 8) > 0) color = emissive * read(emissiveImage, 3).rgb;
+    if ((sampled & 16) > 0) tilt(rough);
     for (int k = 0; k < 4; k++) if (k < channels) w[k] = (term[k] == 0 ? layer * base * (1. - max(f0.r, max(f0.g, f0.b))) : term[k] == 1 ? layer * f0 + metal * base : term[k] == 2 ? layer * (1. - f0) + metal * (1. - base) : dielectric * (1. - factors.x) * base) / scale[k];
   }
   if (lobes > 0 || bands > 0) {

@@ -98,7 +98,7 @@ export function mount(root, ask) {
   const describe = () => {
     const { level, samples, ms } = gpu.stats;
     const size = samples ? `pixels of ${samples} sample${samples > 1 ? "s" : ""}` : level ? (level === 1 ? "pixels" : `pixels of ${level} x ${level}`) : "vertices";
-    line.textContent = `${size} by the browser's GPU${ms ? `, ${ms.toFixed(0)} ms` : ""} · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}`;
+    line.textContent = `${size} by the browser's GPU${ms ? `, ${ms.toFixed(0)} ms` : ""}${gpu.piece.content.reflectedUnit.length ? ", lamps without their highlights" : ""} · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}`;
   };
   const shade = () => {
     stats.sent++;
