@@ -24,6 +24,7 @@ from jaxprt.visibility import LEVELS
 
 _ROW = 32  # texels per row, of which only the brightest is sorted at first
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
+_TOGETHER = 32  # texels whose visibility is read at once
 _value = jit(adaptive.value)
 
 
@@ -58,13 +59,17 @@ class BrightLight(eqx.Module):
         rest: The rest of the light, in the form of the underlying system.
         texel: Indices of the brightest texels.
         excess: Radiance taken out of each of these texels.
-        seen: Visible share of each texel for every vertex, in sixteenths; None before `BrightTexels.shade`.
+        seen: Visible share of each texel for every vertex, in sixteenths; None before `BrightTexels.shade`, and for
+            ideally diffuse surfaces.
+        flux: Vector irradiance / pi of every vertex by all of these texels, for ideally diffuse surfaces; None before
+            `BrightTexels.shade`, and for others.
     """
 
     rest: PyTree
     texel: Int[Array, " t"]
     excess: Float[Array, "t c"]
     seen: UInt8[Array, "t v"] | None = None
+    flux: Float[Array, "c 3 v"] | None = None
 
 
 class BrightView(eqx.Module):
@@ -115,9 +120,16 @@ class BrightTexels(VertexSystem):
         return BrightLight(self.system.light(rest), texel, excess)
 
     def shade(self, light: BrightLight, materials: PyTree = None) -> BrightLight:
-        """Light of the rest that arrives at the vertices, and the visibility of each bright texel."""
-        rest = self.system.shade(light.rest, materials)
-        return BrightLight(rest, light.texel, light.excess, _sixteenths(self.visibility, light.texel))
+        """Light of the rest that arrives at the vertices, and what they see of the bright texels."""
+        return self._seen(dataclasses.replace(light, rest=self.system.shade(light.rest, materials)))
+
+    def _seen(self, light: BrightLight) -> BrightLight:
+        """The light with what vertices see of the bright texels."""
+        if light.seen is not None or light.flux is not None:
+            return light
+        if self.matte and getattr(self.brdf, "matte", False):
+            return dataclasses.replace(light, flux=_vector_flux(self.visibility, light.texel, light.excess))
+        return dataclasses.replace(light, seen=_sixteenths(self.visibility, light.texel))
 
     def tilted(self, light: BrightLight, normal: Float[Array, "v 3"]) -> BrightLight:
         """The light, whose rest is that of the underlying system: `System.tilted`."""
@@ -133,12 +145,14 @@ class BrightTexels(VertexSystem):
         """Radiance: the sum of that of the underlying system and that of the bright texels."""
         require.kind("the light", light, BrightLight, source="BrightTexels.light")
         require.kind("the view", view, BrightView, source="BrightTexels.view")
-        seen = _sixteenths(self.visibility, light.texel) if light.seen is None else light.seen
-        texels = light.texel, light.excess / LEVELS, seen
+        light, rest = self._seen(light), self.system.combine(light.rest, view.rest)
+        if light.flux is not None:
+            flux, normal = self.carried(light.flux, axis=2), view.frame[:, 2].T
+            return rest + jnp.maximum(jnp.sum(flux * normal, 1), 0).T * self.system.diffuse_albedo(view.rest)
+        texels = light.texel, light.excess / LEVELS, light.seen
         options = {"size": self.visibility.size, "samples": self.samples}
         brdf = grid.as_argument(self.brdf)
-        bright = texel_radiance(brdf, view.frame, view.wo, texels, self.points, view.blend, **options)
-        return self.system.combine(light.rest, view.rest) + bright
+        return rest + texel_radiance(brdf, view.frame, view.wo, texels, self.points, view.blend, **options)
 
     def diffuse_albedo(self, view: BrightView) -> Float[Array, "v c"]:
         """The albedo of the underlying system."""
@@ -513,6 +527,28 @@ def _points(texel: Int[Array, " t"], size: int, samples: int, spot: Float[Array,
         middle, width = jnp.moveaxis(spot.reshape(-1, 2, 2, 1, 1), 0, 2)
         direction, _ = points(middle[0] + width[0] * place, middle[1] + width[1] * place[:, None])
     return direction.reshape(len(texel), -1, 3), (area * direction).reshape(len(texel), -1, 3)
+
+
+@jit
+def _vector_flux(visibility: Visibility, texel: Int[Array, " t"], excess: Float[Array, "t c"]) -> Float[Array, "c 3 v"]:
+    """Vector irradiance / pi of every vertex by texels that its normal faces."""
+    count, normal = len(texel), visibility.frame[:, 2].T
+    area = cubemap.vector_area(size=visibility.size).reshape(-1, 3)[texel].astype(excess.dtype)
+    blocks = max(-(-count // _TOGETHER), 1)
+
+    def rows(value: Array) -> Array:
+        return jnp.pad(value, ((0, blocks * _TOGETHER - count), *[(0, 0)] * (value.ndim - 1))).reshape(
+            blocks, _TOGETHER, *value.shape[1:]
+        )
+
+    def flux(block: tuple[Array, Array, Array]) -> Array:
+        texel, area, excess = block
+        seen = jnp.where(_component(normal, area[:, None]) > 0, visibility.visible(texel), 0)
+        light = (excess[:, :, None] * area[:, None]).reshape(_TOGETHER, -1) / np.pi
+        return jnp.matmul(light.T, seen.astype(light.dtype), precision="highest")
+
+    result = total(flux, (rows(texel), rows(area), rows(excess)))
+    return result.reshape(excess.shape[1], 3, -1)
 
 
 def _flux(normal: Float[Array, "3 v"], texel: Array, visible: Float[Array, "t v"], *, size: int) -> Array:

@@ -11,6 +11,7 @@ from jaxprt import bright_texels, harmonic, reference
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.scene import Environment, builtin
 from jaxprt.scene.mesh import join
+from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap
 from jaxprt.visibility import precompute
 
@@ -226,6 +227,27 @@ def test_what_vertices_see_of_the_texels_may_be_looked_up_before_or_with_the_vie
     assert system.shade(lit).seen.shape == (COUNT, len(transport.position))
     np.testing.assert_array_equal(system.combine(system.shade(lit), seen), system.combine(lit, seen))
     close(system.combine(lit, seen), shine(transport, GLOSSY, lit.texel, lit.excess, eye=EYE))
+
+
+def test_bright_texels_on_matte_surfaces_are_one_vector_for_all_views(mesh, transport, sky, close):
+    albedo = jnp.array([0.8, 0.5, 0.2])
+    diffuse = harmonic.DiffuseSystem(harmonic.precompute_diffuse(mesh, size=SIZE), albedo)
+    system = bright_texels.BrightTexels(diffuse, transport, Lambert(albedo), count=40)
+    lit = system.shade(system.light(sky))
+    assert lit.seen is None
+    assert lit.flux is not None
+    rest = diffuse.combine(diffuse.shade(diffuse.light(bright_texels.split(sky, count=40)[2])), diffuse.view(EYE))
+    expected = shine(transport, Lambert(albedo), lit.texel, lit.excess, eye=EYE)
+    close(system.combine(lit, system.view(EYE)) - rest, expected)
+    np.testing.assert_array_equal(
+        system.combine(system.light(sky), system.view(EYE)), system.combine(lit, system.view(EYE))
+    )
+    at = Points(mesh.face[:5].T, jnp.full((3, 5), 1 / 3))
+    points = system.at(at)
+    normal = at.frame(transport.frame)[:, 2]
+    flux = np.einsum("ckv,vk->vc", at.carry(lit.flux, axis=2), normal) * np.asarray(albedo)
+    rest = diffuse.at(at).combine(lit.rest, diffuse.at(at).view(EYE))
+    close(points.combine(lit, points.view(EYE)) - rest, np.maximum(flux, 0))
 
 
 def test_texels_in_any_order_and_twice_over_add_up(transport, sky, close):
