@@ -7,7 +7,7 @@ another in their group, and where each part stands is known on the host.
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -223,7 +223,7 @@ class SceneLight(eqx.Module):
     transferred: PyTree
 
 
-class Arriving(eqx.Module):
+class Arriving(NamedTuple):
     """The light that arrives at a scene.
 
     Attributes:

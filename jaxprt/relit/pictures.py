@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -215,19 +215,11 @@ class PictureView(eqx.Module):
         traced, rows = 0, []
         for row in self.rows:
             sharp = row.number in self.stage.sharp_groups
-            of_row = [light.of_row(traced if sharp else None, self._glow(row, light.share)) for light in lights]
+            of_row = [light.of_row(traced if sharp else None, _glow(self, row, light.share)) for light in lights]
             traced += sharp
             colors = _colors_of_row(self, row, of_row, lamps, apart=apart, recompute=recompute)
             rows.append((row.index, finished(colors, between)))
         return rows
-
-    def _glow(self, row: Row, share: Float[np.ndarray, " n"] | None) -> Float[Array, " p"] | None:
-        """Share of what each point of a row emits; None for all of it."""
-        if share is None:
-            return None
-        triangle = np.asarray(self.pixels.triangle)[np.maximum(row.index, 0)]
-        lamp = np.asarray(self.stage.lamp)[self.stage.part[self.stage.face[np.maximum(triangle, 0), 0]]]
-        return put(np.append(share, 0)[lamp].astype(self.ray.dtype))
 
     def _image(
         self, name: str, rows: Sequence[tuple[Any, tuple[Array, ...]]], light: Environment, behind: Environment | None
@@ -280,7 +272,7 @@ class SceneLighting(eqx.Module):
         return self.scene.shade_lamps(light, {**self.appearances, **lights}, share)
 
 
-class RowLight(eqx.Module):
+class RowLight(NamedTuple):
     """The light that arrives at the points of a row.
 
     Attributes:
@@ -296,7 +288,7 @@ class RowLight(eqx.Module):
     glow: Float[Array, " p"] | None
 
 
-class PictureLight(eqx.Module):
+class PictureLight(NamedTuple):
     """The light that arrives at a picture.
 
     Attributes:
@@ -363,6 +355,16 @@ def _traced_light(picture: PictureView, environment: Environment) -> TracedLight
     return shadows.trace(picture.stage.whole, picture.pixels, picture.camera.width, environment, keep=picture.keep)
 
 
+def _glow(picture: PictureView, row: Row, share: Float[np.ndarray, " n"] | None) -> Float[Array, " p"] | None:
+    """Share of what each point of a row emits; None for all of it."""
+    if share is None:
+        return None
+    stage = picture.stage
+    triangle = np.asarray(picture.pixels.triangle)[np.maximum(row.index, 0)]
+    lamp = np.asarray(stage.lamp)[stage.part[stage.face[np.maximum(triangle, 0), 0]]]
+    return put(np.append(share, 0)[lamp].astype(picture.ray.dtype))
+
+
 def _colors_of_row(
     picture: PictureView,
     row: Row,
@@ -415,7 +417,7 @@ def _lit(
     if light.glow is not None and seen.emitted is not None:
         seen = dataclasses.replace(seen, emitted=seen.emitted * light.glow[:, None])
     if light.traced is not None:
-        texels = TexelLight(*light.traced.row(index), light.traced.rest.radiance.shape[-2], row.samples)
+        texels = TexelLight(*shadows.of_points(light.traced, index), light.traced.rest.radiance.shape[-2], row.samples)
     direct, reflected, lamp = light.arriving.at(row.number)
     color = radiance(surface, (direct, reflected, lamp), seen, texels=texels, reflections=light.reflections)
     if not apart:

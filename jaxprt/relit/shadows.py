@@ -30,7 +30,7 @@ from jaxprt.visibility import picture_rays
 TEXELS = 16  # number of traced texels
 _RANK = 2 * TEXELS  # What exceeds the flux of so many texels is traced; the systems sum about as many texels again.
 _LEAST = 1e-3  # smallest share of the light's flux of a traced texel
-_MORE = 16  # rays of a point beyond one for each texel, shared out by flux
+_MORE = 32  # rays of a point beyond one for each texel, if they had all of the light's flux
 _FINE = 256  # edge of the cubemap whose flux draws the places of rays within texels
 _FEWER = 0.7  # share of the wanted rays with which a texel that was traced before is not traced again
 _KEPT, _MOST = 4, 4 * TEXELS  # number of views whose traced texels are kept, and of texels of each
@@ -65,14 +65,15 @@ class TracedLight(eqx.Module):
     excess: Float[Array, "t c"]
     shares: TexelShares
 
-    def row(self, index: Any) -> tuple[Array, Array, Array, Array]:
-        """The texels, what is taken out of them, their shares at some points, and places; -1 as index is padding."""
-        share = self.shares.share
-        if known(share, index):  # The number of points depends on the view.
-            row = put(np.asarray(share)[:, np.maximum(index, 0)])
-        else:
-            row = jnp.asarray(share)[:, jnp.maximum(index, 0)]
-        return self.shares.texel, self.excess, row, self.shares.place
+
+def of_points(light: TracedLight, index: Any) -> tuple[Array, Array, Array, Array]:
+    """The traced texels, what is taken out of them, their shares at some points, and places; -1 is padding."""
+    shares = light.shares
+    if known(shares.share, index):  # The number of points depends on the view.
+        row = put(np.asarray(shares.share)[:, np.maximum(index, 0)])
+    else:
+        row = jnp.asarray(shares.share)[:, jnp.maximum(index, 0)]
+    return shares.texel, light.excess, row, shares.place
 
 
 def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, keep: bool) -> TracedLight | None:
@@ -98,7 +99,8 @@ def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, k
     bright = np.flatnonzero(flux > 0)
     if not len(bright):
         return None
-    count = np.clip(1 + np.round(_MORE * flux[bright] / flux.sum()).astype(int), 1, picture_rays.PLACES)
+    whole = np.sum(np.asarray(environment.radiance, np.float64).sum(-1) * np.asarray(cubemap.solid_angle(size=size)))
+    count = np.clip(1 + np.round(_MORE * flux[bright] / whole).astype(int), 1, picture_rays.PLACES)
     fine = _finer(environment)
     direction = light_samples.in_texels(number[bright], fine, size=size, count=picture_rays.PLACES)
     share = np.zeros((len(number), len(pixels.triangle)), np.uint8)
