@@ -27,6 +27,7 @@ from benchmarks import denoised, harness
 from benchmarks.pictures import BRDFS, GROUND, LIGHTS, MESHES, NOISE, NOISE_ELSEWHERE, Case, standing, view
 from benchmarks.scenes import file_name
 from jaxprt import precompute
+from jaxprt.brdf import MetallicRoughness
 from jaxprt.relit import Lobes
 from jaxprt.scene import Camera, Environment, builtin, load_environment, load_mesh
 from jaxprt.scene.camera import orbit
@@ -34,6 +35,11 @@ from jaxprt.scene.environment import finer, rotate
 
 VIEWS, TURNS, EDGE = 64, 16, 512
 MEASURED = 3  # pictures that are compared
+MATERIALS = {
+    "spot": ("plastic 0.4", MetallicRoughness((0.6, 0.3, 0.2), metallic=0.0, roughness=0.4)),
+    "rocker arm": ("metal 0.3", BRDFS["metal 0.3"]),
+    "bunny": ("exponent 20", BRDFS["exponent 20"]),
+}
 SAMPLES = (1, 4, 16, 64, 256)
 QUALITIES = ("fast", "balanced", "high")
 MOST = 4096  # samples of a converged picture
@@ -52,7 +58,7 @@ def main(options: Sequence[str] | None = None) -> None:
 
 
 def cases(quick: bool, only: str, edge: int) -> Iterator[Case]:
-    """Three objects under a soft light and a sun; without real data, an embedded one."""
+    """Three objects of three materials under a soft light and a sun; without real data, an embedded one."""
     folder = harness.data()
     if quick or not folder.is_dir():
         ball, size = builtin.sphere(rings=12, sectors=16), 8 if quick else 64
@@ -60,11 +66,12 @@ def cases(quick: bool, only: str, edge: int) -> Iterator[Case]:
         yield Case(("sphere", "studio", "exponent 20"), scene, builtin.studio(size=size), view(ball, 0.5, 16))
         return
     for name, light in itertools.product(MESHES, ("studio", "sunrise")):
-        names = (name, light, "metal 0.3")
+        material, brdf = MATERIALS[name]
+        names = (name, light, material)
         if only in ", ".join(names):
             file, azimuth = MESHES[name]
             mesh = load_mesh(folder / "meshes" / file)
-            scene = standing(name, mesh, BRDFS[names[2]], GROUND)
+            scene = standing(name, mesh, brdf, GROUND)
             environment = load_environment(folder / "env" / LIGHTS[light])
             yield Case(names, scene, environment, view(mesh, azimuth, edge))
 
