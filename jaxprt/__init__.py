@@ -72,4 +72,4 @@ __all__ = [
     "view",
     "visibility",
 ]
-__version__ = "0.1.0"
+__version__ = "0.3.0"
