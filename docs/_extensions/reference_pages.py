@@ -53,7 +53,10 @@ def pages() -> dict[str, str]:
     for name in found:
         outer = [each for each in found if name.startswith(f"{each}.") and each != "jaxprt"]
         short = name.removeprefix("jaxprt.")
-        path[name] = short.replace(".", "/", 1) if outer else short
+        if outer:
+            first = min(outer, key=len).removeprefix("jaxprt.")
+            short = f"{first}/{short.removeprefix(f'{first}.')}"
+        path[name] = short
     for name in found:
         inner = sorted(each for each in path.values() if each.startswith(f"{path[name]}/"))
         if inner:

@@ -20,9 +20,8 @@ def light_probe(environment: Environment, *, tool: str) -> Float[Array, "9 3"]:
 
     Let c be the coefficients in the orthonormal basis, in the order 1, y, z, x, xy, yz, 3 z^2 - 1, xz, x^2 - y^2. Then:
 
-    * "three.js" gets c, the coefficients of radiance: `new LightProbe(new
-    SphericalHarmonics3().fromArray(probe.flat()))`.
-      Its shaders multiply the bands by pi, 2 pi / 3 and pi / 4 for irradiance.
+    * "three.js" gets c, the coefficients of radiance, for `new SphericalHarmonics3().fromArray(probe.flat())`, which a
+      `LightProbe` takes. Its shaders multiply the bands by pi, 2 pi / 3 and pi / 4 for irradiance.
     * "Filament" gets c times the factors of the clamped cosine over pi and of the basis. The sum of coefficients times
       the bare polynomials above is then irradiance over pi: `IndirectLight.Builder.irradiance(3, probe)`.
     * "Unity" gets the same for `SphericalHarmonicsL2`, with `probe[k, color]` for its `sh[color, k]`. Unity's axes are
