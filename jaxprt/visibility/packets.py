@@ -35,6 +35,7 @@ EVERY_FEATURE = 0xFFFFFFFF
 _NONE = 0xFFFFFFFF  # stands for "no geometry" and "no instance"
 _OUT_OF_MEMORY = 4
 _ORIGINS = np.array([[-3, -1], [1, -3], [3, 1], [-1, 3]]) / 8  # places of ray origins in a pixel, from its center
+_GOLDEN, _TRIAL = 0.618, 3  # share of all rays between two turns; fewest turns after which rays may agree
 _POINTER, _INT, _UINT, _SIZE = ctypes.c_void_p, ctypes.c_int, ctypes.c_uint, ctypes.c_size_t
 _PROTOTYPES = {
     "rtcNewDevice": (_POINTER, [ctypes.c_char_p]),
@@ -340,6 +341,11 @@ def trace_shares(query, surface, points, texels, first, last, share):
     ray, valid = ray_buffers(12)
     origin, facing = np.zeros((4, 3, 16), np.float32), np.zeros((3, 16), np.float32)
     above, visible = np.empty(16, np.bool_), np.empty(16)
+    step = np.empty(len(count), np.int64)  # between turns, so that the first ones are spread over the texel
+    for texel in range(len(count)):
+        step[texel] = max(1, int(_GOLDEN * count[texel]))
+        while np.gcd(step[texel], count[texel]) > 1:
+            step[texel] += 1
     for packet in range(first, last, 16):
         lanes = min(16, last - packet)
         for lane in range(lanes):
@@ -350,7 +356,11 @@ def trace_shares(query, surface, points, texels, first, last, share):
                 way = middle[texel]
                 cosine = facing[0, lane] * way[0] + facing[1, lane] * way[1] + facing[2, lane] * way[2]
                 above[lane] = lane < lanes and cosine > 0
-            for turn in range(count[texel] if above.any() else 0):
+            traced = 0
+            while traced < count[texel] and above.any():
+                if traced == max(_TRIAL, -(-count[texel] // 4)) and _agree(above, visible, traced):
+                    break
+                turn = traced * step[texel] % count[texel]
                 for lane in range(16):
                     here = min(lane, lanes - 1)
                     base = pattern[packet + here]
@@ -365,8 +375,21 @@ def trace_shares(query, surface, points, texels, first, last, share):
                 call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
                 for lane in range(lanes):
                     visible[lane] += passed[lane] if above[lane] and ray[8, lane] > 0 else 0.0
+                traced += 1
             for lane in range(lanes):
-                share[texel, packet + lane] = np.uint8(np.floor(255 * visible[lane] / count[texel] + 0.5))
+                share[texel, packet + lane] = np.uint8(np.floor(255 * visible[lane] / max(traced, 1) + 0.5))
+
+
+@no_type_check
+@numba_loop
+def _agree(above, visible, traced):
+    """Whether all rays of all points have passed so far, or none."""
+    clear, count = 0.0, 0
+    for lane in range(16):
+        if above[lane]:
+            clear += visible[lane]
+            count += traced
+    return clear == 0 or clear == count
 
 
 @no_type_check
