@@ -680,7 +680,7 @@ class RelitScene(System):
 
     def with_rays(self, rays: int) -> "RelitScene":
         """The scene with another number of reflection rays for its sharp parts; 0 reflects by harmonics alone."""
-        tracing.check_rays(rays)
+        tracing.check_more_rays(rays, self.rays, self.surfaces)
         return self._replaced(rays=rays)
 
     @promoted

@@ -25,7 +25,7 @@ from jaxprt import require
 from jaxprt.compile import jit, known, put
 from jaxprt.relit import canvas
 from jaxprt.relit.casting import Caster, caster
-from jaxprt.relit.groups import Arriving, Stage, look_at
+from jaxprt.relit.groups import Arriving, Stage, Surface, look_at
 from jaxprt.relit.surface import Viewed, radiance, view
 from jaxprt.scene import Mesh
 from jaxprt.scene.points import Points
@@ -265,3 +265,15 @@ def check_rays(rays: Any) -> None:
     """Refuses anything but a number of rays for each vertex or point."""
     if type(rays) is not int or not 0 <= rays <= _MOST_RAYS:
         raise ValueError(f"rays must be a whole number of at least 0, at most {_MOST_RAYS}, got {require.shown(rays)}")
+
+
+def check_more_rays(rays: Any, before: int, surfaces: Sequence[Surface]) -> None:
+    """`check_rays`, for a scene with a number of rays before; without the lobes that rays are for, it gets none.
+
+    Raises:
+        ValueError: `rays` is not such a number, or the scene was precomputed for harmonics alone.
+    """
+    check_rays(rays)
+    reflecting = [surface for surface in surfaces if surface.reflecting is not None]
+    if rays and not before and reflecting and not any(surface.has_rays for surface in reflecting):
+        raise ValueError(f"rays must be 0 for a scene that was precomputed with rays=0, got {rays}: precompute it anew")

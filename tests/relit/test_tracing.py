@@ -13,7 +13,7 @@ import pytest
 
 import jaxprt as prt
 from jaxprt import bounces, lobe
-from jaxprt.relit import Lobes, RelitScene, casting
+from jaxprt.relit import Lobes, RelitScene, casting, tracing
 from jaxprt.relit.tracing import facing
 from jaxprt.scene import Camera, Environment, Mesh, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.mesh import make_mesh
@@ -212,6 +212,12 @@ def test_rough_parts_have_no_rays_and_bad_numbers_of_them_are_refused():
     with pytest.raises(ValueError, match="rays must be a whole number of at least 0, at most 4096, got -1"):
         relit().with_rays(-1)
     assert relit().with_rays(0).view(EYE).reflected is None
+    without = relit().with_rays(0)
+    assert without.with_rays(8).rays == 8
+    alone = [surface.without_rays for surface in without.surfaces]
+    with pytest.raises(ValueError, match="rays must be 0 for a scene that was precomputed with rays=0, got 8"):
+        tracing.check_more_rays(8, 0, alone)
+    tracing.check_more_rays(8, 8, alone)
     with pytest.raises(ValueError, match="rays must be a whole number of at least 0, at most 4096, got -2"):
         prt.precompute(relit().scene, refine=False, system="lobe", bounces=1, rays=-2)
 
