@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import re
 from collections import Counter
 
 import equinox as eqx
@@ -174,6 +175,16 @@ def test_pixels_of_the_browser_are_those_of_python(case, shaded):
     assert np.mean(same) > 0.3
     off = np.abs(found[..., :3] - true)[same]
     assert off.mean() < SAME * true[same].mean()
+
+
+def test_every_browser_has_as_many_textures_as_the_shader_of_pixels_reads():
+    module = modules.module()
+    texts = [module.split(f"const {name} = `")[1].split("`;")[0] for name in ("SHADE", "BRIGHT")]
+    names = [
+        name for text in texts for row in re.findall(r"uniform \w?sampler2D ([^;]+);", text) for name in row.split(",")
+    ]
+    assert {"place", "bright", "normalImage"} <= {name.strip() for name in names}
+    assert len(names) <= 16  # the least that WebGL2 promises
 
 
 def test_diffuse_light_follows_normal_maps(shaded):
