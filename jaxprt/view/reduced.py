@@ -30,6 +30,7 @@ from jaxprt.view import reflected
 
 FIRST = 2  # finest scale of visibility that is stored as bytes
 MOST_BYTES = 2**27  # largest buffer that graphics cards accept
+_METAL = 0.5  # mean metalness above which lamps are seen by their highlights
 _GRAY = 0.5  # albedo that stands for a BRDF without a standard table
 _TEXELS = 64  # number of brightest texels that are summed one by one
 
@@ -106,8 +107,11 @@ class PageScene:
         """All that a page can show of a scene without bounces, as finely as graphics cards hold it.
 
         Raises:
-            ValueError: A page cannot show the system or the layers of a part.
+            ValueError: A page cannot show the system or the layers of a part, or the highlights of lamps on metals.
         """
+        rows = zip(relit.scene.names, relit.scene.parts, strict=True)
+        if relit.lamps is not None and (metals := [name for name, part in rows if _shines(part.material)]):
+            raise ValueError(f"lamps shine on these parts by highlights: {', '.join(map(repr, metals))}")
         if layered := [name for name, row in zip(relit.scene.names, relit.shading, strict=True) if row.layered]:
             raise ValueError(f"these parts have clear coats or sheens: {', '.join(map(repr, layered))}")
         page = cls.of(relit.without_bounces())
@@ -307,6 +311,16 @@ def unit_of(values: Sequence[np.ndarray]) -> Float[np.ndarray, " k"]:
         now = np.abs(rows).max(tuple(range(1, rows.ndim)), initial=0)
         largest[: len(rows)] = np.maximum(largest[: len(rows)], now)
     return np.maximum(largest, 1e-12) / 127
+
+
+def _shines(material: Any) -> bool:
+    """Whether a material reflects more light by highlights than diffusely."""
+    if not hasattr(material, "metallic"):
+        diffuse, specular = (np.max(np.asarray(getattr(material, name, 0.0))) for name in ("diffuse", "specular"))
+        return bool(diffuse < specular)
+    texture = getattr(material, "metallic_texture", None)
+    share = 1.0 if texture is None else np.mean(np.asarray(texture.image))
+    return bool(np.mean(np.asarray(material.metallic)) * share > _METAL)
 
 
 def _rounded(values: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -295,6 +295,10 @@ def test_why_a_scene_is_not_shaded_by_the_gpu_is_said(systems, lights, look):
     others = RelitScene(
         skewed.scene, skewed.shading, Place.apart(skewed.place.counts), (ball, put(skewed.part_system(1)))
     )
+    metal = mapped(metallic=1.0, roughness=0.4)
+    lit = prt.precompute(scene_of(metal, MATTE), refine=False, system=CASES["metal"][2], size=SIZE, progress=False)
+    with pytest.raises(ValueError, match="lamps shine on these parts by highlights: 'ball'"):
+        PageScene.for_gpu(lit)
     session = Session({"lobes": bare, "others": others}, environments=lights)
     content, buffers = session.answer({"kind": "page", "system": "lobes"})
     assert (content["kind"], content["visibility"], len(buffers)) == ("page", True, 10 + len(content["rims"]) + 2)
