@@ -61,15 +61,15 @@ class BrightLight(eqx.Module):
         excess: Radiance taken out of each of these texels.
         seen: Visible share of each texel for every vertex, in sixteenths; None before `BrightTexels.shade`, and for
             ideally diffuse surfaces.
-        flux: Vector irradiance / pi of every vertex by all of these texels, for ideally diffuse surfaces; None before
-            `BrightTexels.shade`, and for others.
+        flux: Vector irradiance / pi of every vertex by all of these texels, and then its irradiance / pi, for ideally
+            diffuse surfaces; None before `BrightTexels.shade`, and for others.
     """
 
     rest: PyTree
     texel: Int[Array, " t"]
     excess: Float[Array, "t c"]
     seen: UInt8[Array, "t v"] | None = None
-    flux: Float[Array, "c 3 v"] | None = None
+    flux: Float[Array, "c 4 v"] | None = None
 
 
 class BrightView(eqx.Module):
@@ -147,12 +147,26 @@ class BrightTexels(VertexSystem):
         require.kind("the view", view, BrightView, source="BrightTexels.view")
         light, rest = self._seen(light), self.system.combine(light.rest, view.rest)
         if light.flux is not None:
-            flux, normal = self.carried(light.flux, axis=2), view.frame[:, 2].T
-            return rest + jnp.maximum(jnp.sum(flux * normal, 1), 0).T * self.system.diffuse_albedo(view.rest)
+            return rest + self._diffuse(light.flux, view).T * self.system.diffuse_albedo(view.rest)
         texels = light.texel, light.excess / LEVELS, light.seen
         options = {"size": self.visibility.size, "samples": self.samples}
         brdf = grid.as_argument(self.brdf)
         return rest + texel_radiance(brdf, view.frame, view.wo, texels, self.points, view.blend, **options)
+
+    def _diffuse(self, flux: Float[Array, "c 4 v"], view: BrightView) -> Float[Array, "c _"]:
+        """Irradiance / pi by the bright texels.
+
+        Between vertices the vector of a sun stays as it is, and that of light from everywhere turns with the normal.
+        The interpolated vector is too short for the second kind, and interpolated irradiance too dark for the first.
+        """
+        if self.points is None:
+            return flux[:, 3]
+        flux, normal = self.carried(flux, axis=2), view.frame[:, 2].T
+        smooth = normal
+        if self.points.normal is not None:
+            smooth = self.points.tilted(None).frame(self.visibility.frame)[:, 2].T
+        upright, tilted = (jnp.sum(flux[:, :3] * axis, 1) for axis in (smooth, normal))
+        return jnp.maximum(tilted + jnp.maximum(flux[:, 3] - upright, 0), 0)
 
     def diffuse_albedo(self, view: BrightView) -> Float[Array, "v c"]:
         """The albedo of the underlying system."""
@@ -530,8 +544,8 @@ def _points(texel: Int[Array, " t"], size: int, samples: int, spot: Float[Array,
 
 
 @jit
-def _vector_flux(visibility: Visibility, texel: Int[Array, " t"], excess: Float[Array, "t c"]) -> Float[Array, "c 3 v"]:
-    """Vector irradiance / pi of every vertex by texels that its normal faces."""
+def _vector_flux(visibility: Visibility, texel: Int[Array, " t"], excess: Float[Array, "t c"]) -> Float[Array, "c 4 v"]:
+    """Vector irradiance / pi of every vertex by texels that its normal faces, and its irradiance / pi."""
     count, normal = len(texel), visibility.frame[:, 2].T
     area = cubemap.vector_area(size=visibility.size).reshape(-1, 3)[texel].astype(excess.dtype)
     blocks = max(-(-count // _TOGETHER), 1)
@@ -547,8 +561,8 @@ def _vector_flux(visibility: Visibility, texel: Int[Array, " t"], excess: Float[
         light = (excess[:, :, None] * area[:, None]).reshape(_TOGETHER, -1) / np.pi
         return jnp.matmul(light.T, seen.astype(light.dtype), precision="highest")
 
-    result = total(flux, (rows(texel), rows(area), rows(excess)))
-    return result.reshape(excess.shape[1], 3, -1)
+    result = total(flux, (rows(texel), rows(area), rows(excess))).reshape(excess.shape[1], 3, -1)
+    return jnp.concatenate([result, jnp.sum(result * normal, 1, keepdims=True)], 1)
 
 
 def _flux(normal: Float[Array, "3 v"], texel: Array, visible: Float[Array, "t v"], *, size: int) -> Array:

@@ -243,11 +243,15 @@ def test_bright_texels_on_matte_surfaces_are_one_vector_for_all_views(mesh, tran
         system.combine(system.light(sky), system.view(EYE)), system.combine(lit, system.view(EYE))
     )
     at = Points(mesh.face[:5].T, jnp.full((3, 5), 1 / 3))
-    points = system.at(at)
-    normal = at.frame(transport.frame)[:, 2]
-    flux = np.einsum("ckv,vk->vc", at.carry(lit.flux, axis=2), normal) * np.asarray(albedo)
-    rest = diffuse.at(at).combine(lit.rest, diffuse.at(at).view(EYE))
-    close(points.combine(lit, points.view(EYE)) - rest, np.maximum(flux, 0))
+    frame = np.asarray(at.frame(transport.frame))[:, 2]
+    row = np.asarray(at.carry(lit.flux, axis=2))
+    tilted = at.tilted(frame + 0.2 * np.roll(frame, 1, 1))
+    upright = np.einsum("ckv,vk->vc", row[:, :3], frame)
+    for place, normal in ((at, frame), (tilted, np.asarray(tilted.normal).T)):
+        points, under = system.at(place), diffuse.at(place)
+        flux = np.einsum("ckv,vk->vc", row[:, :3], normal) + np.maximum(row[:, 3].T - upright, 0)
+        found = points.combine(lit, points.view(EYE)) - under.combine(lit.rest, under.view(EYE))
+        close(found, np.maximum(flux, 0) * np.asarray(albedo))
 
 
 def test_texels_in_any_order_and_twice_over_add_up(transport, sky, close):
