@@ -150,7 +150,7 @@ def mapped(**parameters):
 
 CASES = {
     "normal map": (
-        mapped(base_color=(0.9, 0.7, 0.3), metallic=1.0, roughness=0.4),
+        mapped(base_color=(0.9, 0.7, 0.3), metallic=0.5, roughness=0.4),
         MATTE,
         prt.relit.Lobes(8, texels=2),
     ),
