@@ -107,7 +107,8 @@ class PageScene:
         """All that a page can show of a scene without bounces, as finely as graphics cards hold it.
 
         Raises:
-            ValueError: A page cannot show the system or the layers of a part, or the highlights of lamps on metals.
+            ValueError: A page cannot show the system or the layers of a part, or how lamps light it: by highlights on
+                metals, or through transfer matrices.
         """
         rows = zip(relit.scene.names, relit.scene.parts, strict=True)
         if relit.lamps is not None and (metals := [name for name, part in rows if _shines(part.material)]):
@@ -115,6 +116,9 @@ class PageScene:
         if layered := [name for name, row in zip(relit.scene.names, relit.shading, strict=True) if row.layered]:
             raise ValueError(f"these parts have clear coats or sheens: {', '.join(map(repr, layered))}")
         page = cls.of(relit.without_bounces())
+        pairs = zip(relit.scene.names, page.reflected or (), strict=False)
+        if unlit := [name for name, rows in pairs if not len(rows)]:
+            raise ValueError(f"lamps light these parts through transfer matrices: {', '.join(map(repr, unlit))}")
         scale, level = page.scales, FIRST
         if scale is None:
             return page.reduced(0, texels=False)

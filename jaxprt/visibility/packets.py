@@ -35,7 +35,8 @@ EVERY_FEATURE = 0xFFFFFFFF
 _NONE = 0xFFFFFFFF  # stands for "no geometry" and "no instance"
 _OUT_OF_MEMORY = 4
 _ORIGINS = np.array([[-3, -1], [1, -3], [3, 1], [-1, 3]]) / 8  # places of ray origins in a pixel, from its center
-_GOLDEN, _TRIAL = 0.618, 3  # share of all rays between two turns; fewest turns after which rays may agree
+_GOLDEN = 0.618  # share of all rays between two turns
+_ENOUGH = 48  # rays of a packet that tell, if they agree, that others would agree with them
 _POINTER, _INT, _UINT, _SIZE = ctypes.c_void_p, ctypes.c_int, ctypes.c_uint, ctypes.c_size_t
 _PROTOTYPES = {
     "rtcNewDevice": (_POINTER, [ctypes.c_char_p]),
@@ -358,7 +359,7 @@ def trace_shares(query, surface, points, texels, first, last, share):
                 above[lane] = lane < lanes and cosine > 0
             traced = 0
             while traced < count[texel] and above.any():
-                if traced == max(_TRIAL, -(-count[texel] // 4)) and _agree(above, visible, traced):
+                if 4 * traced >= count[texel] and _agree(above, visible, traced):
                     break
                 turn = traced * step[texel] % count[texel]
                 for lane in range(16):
@@ -383,13 +384,13 @@ def trace_shares(query, surface, points, texels, first, last, share):
 @no_type_check
 @numba_loop
 def _agree(above, visible, traced):
-    """Whether all rays of all points have passed so far, or none."""
+    """Whether enough rays have been traced, and all of all points have passed, or none."""
     clear, count = 0.0, 0
     for lane in range(16):
         if above[lane]:
             clear += visible[lane]
             count += traced
-    return clear == 0 or clear == count
+    return count >= _ENOUGH and (clear == 0 or clear == count)
 
 
 @no_type_check

@@ -90,7 +90,8 @@ def test_a_kept_view_traces_new_texels_alone(relit, monkeypatch):
     view, cast = relit.picture_view(), shadows._cast
     traced = []
     monkeypatch.setattr(shadows, "_cast", lambda *given: traced.append(len(given[3].per_texel)) or cast(*given))
-    for light, count in ((sunny(), 1), (sunny(51.0), None), (sunny(texel=SUN + 3), 1)):
+    brighter = Environment(1.6 * sunny().radiance)
+    for light, count in ((sunny(), 1), (sunny(51.0), None), (brighter, None), (sunny(texel=SUN + 3), 1)):
         color = view.picture(light)
         assert traced == ([] if count is None else [count])
         traced.clear()

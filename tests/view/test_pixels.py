@@ -299,6 +299,10 @@ def test_why_a_scene_is_not_shaded_by_the_gpu_is_said(systems, lights, look):
     lit = prt.precompute(scene_of(metal, MATTE), refine=False, system=CASES["metal"][2], size=SIZE, progress=False)
     with pytest.raises(ValueError, match="lamps shine on these parts by highlights: 'ball'"):
         PageScene.for_gpu(lit)
+    lamp = TexturedMaterial(metallic=0.0, emissive=2.0)
+    rough = prt.precompute(scene_of(lamp, GLOSSY), refine=False, system=CASES["harmonic"][2], size=SIZE, progress=False)
+    with pytest.raises(ValueError, match="lamps light these parts through transfer matrices: 'ball', 'ground'"):
+        PageScene.for_gpu(rough)
     session = Session({"lobes": bare, "others": others}, environments=lights)
     content, buffers = session.answer({"kind": "page", "system": "lobes"})
     assert (content["kind"], content["visibility"], len(buffers)) == ("page", True, 10 + len(content["rims"]) + 2)

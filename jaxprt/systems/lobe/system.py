@@ -34,7 +34,7 @@ from jaxprt.systems.protocol import Blend
 _LEAST = 1e-3  # smallest visibility by which the shift of a lobe is divided
 _FARTHEST = 2.5  # largest shift of the mean of the visible part, in standard deviations
 _TINY = 1e-12
-_FLANK = 0.55  # spread of a lobe whose flanks, at 45 degrees, are as steep as those of a cosine
+_FLANK = 0.55  # spread of a lobe whose flanks, at 50 degrees, are as steep as those of a cosine
 _DARK, _BRIGHTEST = 1e-6, 4.0  # least light that tilted normals are compared with, and largest ratio to it
 
 

@@ -95,10 +95,12 @@ export function mount(root, ask) {
   };
   // Whether the GPU shades the present state. A slow one leaves it to Python, if that is quicker.
   const shades = () => gpu !== null && asked === state.system && gpu.piece.content.system === state.system && !state.bounces && !gpu.piece.fixed(state.materials) && !(gpu.slow && scene.rests.length && (looked < TRIES || stats.trip < 2 * gpu.stats.ms));
+  // Pages hold a row for each harmonic of reflected light, and the last one for lamps.
+  const lessLit = () => ["", ", lamps without highlights"][gpu.piece.content.reflectedUnit.length] ?? ", reflected light without highlights";
   const describe = () => {
     const { level, samples, ms } = gpu.stats;
     const size = samples ? `pixels of ${samples} sample${samples > 1 ? "s" : ""}` : level ? (level === 1 ? "pixels" : `pixels of ${level} x ${level}`) : "vertices";
-    line.textContent = `${size} by the browser's GPU${ms ? `, ${ms.toFixed(0)} ms` : ""}${gpu.piece.content.reflectedUnit.length ? ", lamps without their highlights" : ""} · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}`;
+    line.textContent = `${size} by the browser's GPU${ms ? `, ${ms.toFixed(0)} ms` : ""}${lessLit()} · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}`;
   };
   const shade = () => {
     stats.sent++;
