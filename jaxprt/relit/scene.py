@@ -591,7 +591,7 @@ class RelitScene(System):
     ) -> PictureView:
         """All of a picture that does not depend on the light: `picture_view(camera).picture(environment)` renders it.
 
-        It is faster for many lights, and stores about a kilobyte for each shaded point. `picture` gives the errors.
+        It is faster for many lights, and stores about a kilobyte for each shaded point. Raises what `picture` raises.
 
         Args:
             camera: As for `picture`.
