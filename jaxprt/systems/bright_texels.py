@@ -154,10 +154,11 @@ class BrightTexels(VertexSystem):
         return rest + texel_radiance(brdf, view.frame, view.wo, texels, self.points, view.blend, **options)
 
     def _diffuse(self, flux: Float[Array, "c 4 v"], view: BrightView) -> Float[Array, "c _"]:
-        """Irradiance / pi by the bright texels.
+        """Irradiance / pi by the bright texels: max(F . n + max(E - F . m, 0), 0).
 
-        Between vertices the vector of a sun stays as it is, and that of light from everywhere turns with the normal.
-        The interpolated vector is too short for the second kind, and interpolated irradiance too dark for the first.
+        F and E are the vector and the irradiance of the vertices, interpolated; m is the smooth normal, and n that with
+        the normal map. Between vertices the vector of a sun stays as it is, and that of light from
+        everywhere turns with the normal. F is too short for the second kind, and E too dark for the first.
         """
         if self.points is None:
             return flux[:, 3]

@@ -116,7 +116,7 @@ class PageScene:
         if layered := [name for name, row in zip(relit.scene.names, relit.shading, strict=True) if row.layered]:
             raise ValueError(f"these parts have clear coats or sheens: {', '.join(map(repr, layered))}")
         page = cls.of(relit.without_bounces())
-        pairs = zip(relit.scene.names, page.reflected or (), strict=False)
+        pairs = [] if page.reflected is None else zip(relit.scene.names, page.reflected, strict=True)
         if unlit := [name for name, rows in pairs if not len(rows)]:
             raise ValueError(f"lamps light these parts through transfer matrices: {', '.join(map(repr, unlit))}")
         scale, level = page.scales, FIRST

@@ -1,9 +1,4 @@
-"""What points of a picture see of texels and of lamps, beside single rays and closed forms.
-
-Rays from points of a picture to texels, beside single rays and closed forms.
-
-What points of a picture see of lamps, against closed forms.
-"""
+"""What points of a picture see of texels and of lamps, beside single rays and closed forms."""
 
 import jax
 import numpy as np
@@ -61,6 +56,23 @@ def test_shares_are_those_of_single_rays_to_every_place():
         point, way = (each.ravel() for each in np.indices((len(start), len(direction))))
         open_ = 1 - occluder.blocked(start, direction, point, way).reshape(len(start), -1).mean(1)
         np.testing.assert_allclose(share[texel] / picture_rays.FULL, open_, atol=0.5 / picture_rays.FULL + 1e-6)
+
+
+def test_rays_that_are_left_out_where_others_agree_lose_no_thin_shadow():
+    """The half-shadow of a bar across a row of neighboring points, of which packets far from it see all."""
+    corner = np.array([[-0.03, 0.5, -2], [0.03, 0.5, -2], [0.03, 0.5, 2], [-0.03, 0.5, 2]])
+    floor, bar = square(-2, 2, 0.0), make_mesh(corner, np.array([[0, 2, 1], [0, 3, 2]]))
+    occluder, (_, rays) = Occluder(join([floor, bar])), rays_up(count=picture_rays.PLACES)
+    first = np.linspace(0.44, 0.56, 400)
+    place = np.stack([first, 0.05 * np.ones(400), 0.95 - first], -1)
+    share = picture_rays.shares(floor, occluder, points_on(floor, place), rays) / picture_rays.FULL
+    start = (place @ np.asarray(floor.position)[np.asarray(floor.face)[0]] + [0, 1e-5, 0]).astype(np.float32)
+    for row, direction in zip(share, rays.direction, strict=True):
+        point, way = (each.ravel() for each in np.indices((len(start), len(direction))))
+        seen = 1 - occluder.blocked(start, direction, point, way).reshape(len(start), -1).mean(1)
+        assert 0.2 < (seen < 1).mean() < 0.8
+        np.testing.assert_allclose(row, seen, atol=0.1)
+        assert abs((1 - row).sum() / (1 - seen).sum() - 1) < 0.01
 
 
 def test_an_edge_inside_of_a_pixel_is_seen_by_its_share():
