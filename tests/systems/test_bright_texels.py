@@ -14,6 +14,7 @@ from jaxprt.scene.mesh import join
 from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap
 from jaxprt.visibility import precompute
+from jaxprt.visibility.blocks import Run
 
 SIZE = 8
 ALL = 6 * SIZE**2
@@ -252,6 +253,25 @@ def test_bright_texels_on_matte_surfaces_are_one_vector_for_all_views(mesh, tran
         flux = np.einsum("ckv,vk->vc", row[:, :3], normal) + np.maximum(row[:, 3].T - upright, 0)
         found = points.combine(lit, points.view(EYE)) - under.combine(lit.rest, under.view(EYE))
         close(found, np.maximum(flux, 0) * np.asarray(albedo))
+
+
+@pytest.mark.parametrize(("count", "most"), [(1, 0.03), (64, 0.01)])
+def test_points_of_a_matte_ball_are_lit_by_their_cosines(count, most):
+    """A ball alone: nothing but its own horizon hides a sun of one texel, or a sky of many."""
+    ball, random = builtin.sphere(rings=12, sectors=24), np.random.default_rng(count)
+    seen = precompute(ball, size=SIZE, run=Run(progress=False))
+    sky = np.zeros((6 * SIZE**2, 3), np.float32)
+    sky[random.choice(len(sky), count, replace=False)] = random.uniform(50, 100, (count, 1))
+    diffuse = harmonic.DiffuseSystem(harmonic.precompute_diffuse(ball, size=SIZE), jnp.ones(3))
+    system = bright_texels.BrightTexels(diffuse, seen, Lambert([1.0, 1.0, 1.0]), count=count)
+    lit = system.shade(system.light(Environment(jnp.asarray(sky.reshape(6, SIZE, SIZE, 3)))))
+    at = Points(ball.face.T, jnp.asarray(random.dirichlet([1, 1, 1], len(ball.face)).T, jnp.float32))
+    area = np.asarray(cubemap.vector_area(size=SIZE)).reshape(-1, 3)[np.asarray(lit.texel)]
+    cosine = np.maximum(np.asarray(at.frame(seen.frame))[:, 2] @ area.T, 0)
+    expected = cosine @ np.asarray(lit.excess) / np.pi
+    points, under = system.at(at), diffuse.at(at)
+    found = points.combine(lit, points.view(EYE)) - under.combine(lit.rest, under.view(EYE))
+    assert np.linalg.norm(found - expected) < most * np.linalg.norm(expected)
 
 
 def test_texels_in_any_order_and_twice_over_add_up(transport, sky, close):
