@@ -49,7 +49,7 @@ export class Piece {
       place[8 * i + c] = this.position[3 * i + c];
       place[8 * i + 4 + c] = this.normal[3 * i + c] / 32767;
     }
-    for (let i = 0; 4 * i < this.tangents.length; i++) { // and the handedness as sign: WebGL2 has no more than 16 textures
+    for (let i = 0; 4 * i < this.tangents.length; i++) { // with the handedness as sign, in components that are free: WebGL2 promises 16 textures
       const [x, y, z, hand] = this.tangents.subarray(4 * i, 4 * i + 4);
       place[8 * i + 3] = Math.sign(hand) * (1 + (x + 127) + 255 * (y + 127) + 255 ** 2 * (z + 127));
     }

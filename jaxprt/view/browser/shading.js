@@ -275,7 +275,7 @@ void tilt(inout float rough) {
   normal = normalize(along * side.x + cross(normal, along) * side.y + normal * height);
 #if CORNERS == 3
   vec2 size = vec2(textureSize(normalImage, 0)), x = placed(toRight, 4, 0.) * size, y = placed(toTop, 4, 0.) * size;
-  float square = clamp(dot(mean, mean), 1e-4, 1.), texels = min(.41 * max(dot(x, x), dot(y, y)), 1.);
+  float square = clamp(dot(mean, mean), 1e-4, 1.), texels = min(.41 * max(dot(x, x), dot(y, y)), 1.); // by the square of SHARPER in jaxprt/scene/material_table.py
   float variance = (1. - square) / (sqrt(square) * (3. - square)) * slope * slope * texels;
   rough = min(log(exp(4. * rough) + 2. * variance) / 4., max(rough, 0.));
 #endif
