@@ -14,14 +14,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import paper_scenes, path_tracing
+from benchmarks import paper_scenes
 from benchmarks.figures import drawing
 from benchmarks.paper_recipes import RECIPES, Look
 from benchmarks.paper_scenes import Made
+from benchmarks.path_tracing import Exact
 from benchmarks.published import interiors
 from jaxprt import image
-from jaxprt.brdf import Lambert
-from jaxprt.relit.groups import joined_mesh
 from jaxprt.scene import Camera, Environment, builtin
 from jaxprt.scene.environment import add_disk
 from jaxprt.sphere import cubemap
@@ -32,6 +31,7 @@ LAYERS = ("color", "direct", "reflected", "alpha", "normal", "position", "part")
 LAMPS = {
     "bust": ((-0.55, 0.75, 0.55), 8, 0.05),
     "bird": ((0.5, 1.2, -0.2), 12, 0.05),
+    "airplane": ((-0.5, 0.9, 0.6), 12, 0.05),
     "chess": ((-0.35, 0.62, -1.0), 12, 0.02),
     "watch": ((-0.6, 0.9, 0.5), 14, 0.3),
 }
@@ -44,6 +44,7 @@ METALS = {  # specular weights of case and bracelet, and roughness
     "black steel": ([0.12, 0.12, 0.14], [0.12, 0.12, 0.14], 0.35),
 }
 _RUST, _GOLD = np.array([0.6, 0.14, 0.05]), np.array([1.0, 0.72, 0.28])
+SHININESS = 6.0, 60.0, 200.0  # exponents of Figure 13
 _STRONGER = 3  # how many times what the bust sends to the walls is shown
 _FACING = 0.1  # least cosine by which a surface looks away from the lamp, or down
 
@@ -79,36 +80,6 @@ def soft_box(direction: Any, degrees: float, dim: float, *, size: int) -> Enviro
     return add_disk(light, np.asarray(direction, float), angle=float(angle), radiance=float(1 / np.sin(angle) ** 2))
 
 
-def models(ready: Made, changed: Look | None = None) -> list[Any]:
-    """BRDFs of all regions, for Mitsuba; `changed` is that of `Made.materials`."""
-    free = ready.materials(changed)
-    names = [part.name for part in ready.scene.scene.parts]
-    return [free.get(name) or Lambert(ready.recipe.fixed[int(name)]) for name in names]
-
-
-def traced(
-    ready: Made,
-    changed: Look | None = None,
-    *,
-    camera: Camera,
-    light: Environment | None = None,
-    bounces: int = 2,
-    samples: int = SAMPLES,
-    seed: int = 0,
-) -> np.ndarray:
-    """Mitsuba's picture of a scene with so many bounces, with the coverage of ours."""
-    radiance = path_tracing.picture(
-        joined_mesh(ready.scene.shading),
-        models(ready, changed),
-        paper_scenes.light_of(ready) if light is None else light,
-        camera,
-        depth=2 + bounces,
-        samples=samples,
-        seed=seed,
-    )
-    return np.concatenate([radiance, ready.scene.coverage(camera)[..., None]], -1)
-
-
 def off(mine: np.ndarray, exact: np.ndarray, where: np.ndarray | None = None) -> float:
     """Relative L2 of a picture against another, noise included, over the pixels that the scene fills.
 
@@ -117,35 +88,6 @@ def off(mine: np.ndarray, exact: np.ndarray, where: np.ndarray | None = None) ->
     inside = (exact[..., 3] == 1) & (mine[..., 3] == 1)
     inside = inside if where is None else inside & where
     return float(np.linalg.norm((mine - exact)[inside]) / np.linalg.norm(exact[inside, :3]))
-
-
-class Exact(NamedTuple):
-    """Mitsuba's picture as two of independent noise, so that noise does not count as error.
-
-    Attributes:
-        first: One half of the samples.
-        second: The other half.
-    """
-
-    first: np.ndarray
-    second: np.ndarray
-
-    @property
-    def picture(self) -> np.ndarray:
-        """The mean of both."""
-        return (self.first + self.second) / 2
-
-    def off(self, mine: np.ndarray, where: np.ndarray | None = None) -> float:
-        """Relative L2 of a picture over some pixels that the scene fills, all if None, without the noise of the halves.
-
-        The mean product of the differences from two pictures of independent noise is the square of the difference from
-        their expectation.
-        """
-        inside = (mine[..., 3] == 1) & (self.first[..., 3] == 1)
-        inside = inside if where is None else inside & where
-        one, other, ours = (picture[inside][:, :3].astype(np.float64) for picture in (self.first, self.second, mine))
-        square, whole = np.sum((ours - one) * (ours - other)), np.sum(one * other)
-        return float(np.sqrt(max(square, 0.0) / whole))
 
 
 def mean(picture: np.ndarray, where: np.ndarray) -> float:
@@ -250,7 +192,7 @@ class Figures:
         """Mitsuba's picture; None where it is not asked for."""
         if not self.compare:
             return None
-        return Exact(*(traced(ready, changed, samples=self.samples, seed=seed, **options) for seed in (0, 1)))
+        return paper_scenes.traced(ready, changed, samples=self.samples, **options)
 
     def figure_1(self) -> Sheet:
         """A bust whose BRDF moves along a curve in the plane of Fresnel reflectance and roughness.
@@ -375,20 +317,40 @@ class Figures:
         return Sheet(pictures, lines)
 
     def figure_13(self) -> Sheet:
-        """Shininess of a base, above, and of what stands on it, below."""
+        """Shininess of a base, above; of what stands on it, in the middle, and below what that sends to the base."""
         ready = self.scene("airplane")
-        (color, gloss, _), (ground, base, _) = (RECIPES["airplane"].free[number] for number in (0, 1))
-        pictures, lines = {}, []
-        for part, name, other in ((1, "base", 0), (0, "object", 1)):
-            first = None
-            for n in (6.0, 60.0, 200.0):
-                look = {1: (ground, base, n)} if part else {0: (color, gloss, n)}
-                drawn = self.layers(ready, look, rays=paper_scenes.RAYS)
-                first = drawn.color if first is None else first
-                changed = off(drawn.color, first, drawn.region(other))
-                lines.append({"part": name, "exponent": n, "changed": changed})
-                pictures[f"{name}, exponent {n:g}\nthe other part: {share(changed)} changed"] = drawn.color
-        return Sheet(pictures, lines)
+        light, camera = self.lamp(ready), self.camera(ready)
+        pictures, sent, lines = {}, {}, []
+        first = None
+        for n in SHININESS:
+            look = {1: (0.3, 0.5, n)}
+            drawn = self.layers(ready, look, light=light, camera=camera, rays=paper_scenes.RAYS)
+            first = drawn.color if first is None else first
+            line = {"part": "base", "exponent": n, "changed": off(drawn.color, first, drawn.region(0))}
+            exact, caption = self.mitsuba(ready, look, light=light, camera=camera), f"base, exponent {n:g}"
+            caption += _judged(line, exact, "", drawn.color, drawn.region(0, 1))
+            pictures[caption] = drawn.color
+            lines.append(line)
+        pale = (0.5, 0.0, 20.0)
+        dark = {0: (0.0, 0.0, 20.0), 1: pale}
+        black, unlit = self.layers(ready, dark, light=light, camera=camera), None
+        base = black.region(1)
+        if self.compare:
+            unlit = self.mitsuba(ready, dark, light=light, camera=camera)
+        for n in SHININESS:
+            look = {0: (RECIPES["airplane"].free[0][0], 0.6, n), 1: pale}
+            color = self.layers(ready, look, light=light, camera=camera, rays=paper_scenes.RAYS).color
+            reached = np.where(base[..., None], color[..., :3] - black.color[..., :3], 0)
+            line = {"part": "object", "exponent": n, "red_over_blue": _red(reached)}
+            exact, caption = self.mitsuba(ready, look, light=light, camera=camera), f"object, exponent {n:g}"
+            caption += _judged(line, exact, "", color, base)
+            if exact is not None and unlit is not None:
+                line["red_over_blue_exact"] = _red((exact.picture - unlit.picture)[base])
+            pictures[caption] = color
+            caption = f"{n:g}: what it sends, {_STRONGER} times\nred {line['red_over_blue']:.2f} of blue"
+            sent[caption] = np.concatenate([_STRONGER * np.maximum(reached, 0), color[..., 3:]], -1)
+            lines.append(line)
+        return Sheet({**pictures, **sent}, lines, next(iter(pictures.values())))
 
     def ring(self) -> Sheet:
         """The caustic of Figure 13: exponents of a ring, with direct light and both bounces."""
@@ -504,6 +466,11 @@ def _beside(picture: np.ndarray, ball: np.ndarray) -> np.ndarray:
 def _peak(picture: np.ndarray, where: np.ndarray) -> float:
     """The radiance that a thousandth of some pixels exceeds, over the colors."""
     return float(np.quantile(np.mean(picture[where][:, :3], 1), 0.999))
+
+
+def _red(radiance: np.ndarray) -> float:
+    """Red light over blue light, summed over pixels."""
+    return float(np.sum(radiance[..., 0], dtype=np.float64) / np.sum(radiance[..., 2], dtype=np.float64))
 
 
 def _watch(case: Any, bracelet: Any, m: float) -> Look:

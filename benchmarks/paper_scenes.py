@@ -18,7 +18,10 @@ drawn, as in the paper. `view` has a new view in each frame, `material` a new vi
 light too. `peer_seconds` are the paper's, on two Xeons of 3.2 GHz and a GeForce 7800 in 2007: Table 1 of the paper,
 columns V, V&B and V,B&L, and for `precompute` the sum of its columns Precomp and Compress.
 
-`error` is what the tensor of the first bounce leaves out of what arrives, rms over clusters.
+`error` is what the tensor of the first bounce leaves out of what arrives, rms over clusters. Where Mitsuba 3 can run,
+lines have errors against it with as many bounces, in the light's own pixels, over the pixels that the scene fills:
+`frame_error` of a frame as it is timed, `picture_error` of a picture whose radiance is that of its pixels, with
+reflection rays, and `direct_error` of that picture without bounces.
 """
 
 import dataclasses
@@ -26,6 +29,7 @@ import itertools
 import json
 import pathlib
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -38,11 +42,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxprt as prt
-from benchmarks import harness
+from benchmarks import harness, path_tracing
 from benchmarks.paper_recipes import RECIPES, Look, Published, Recipe
+from benchmarks.path_tracing import Exact
 from benchmarks.published.lobes import BrdfSet
 from jaxprt import bounces, separable
-from jaxprt.brdf import BlinnPhong, CookTorrance
+from jaxprt.brdf import BlinnPhong, CookTorrance, Lambert
 from jaxprt.image import render
 from jaxprt.relit import Dynamic, paths
 from jaxprt.relit.groups import joined_mesh
@@ -54,9 +59,11 @@ from jaxprt.systems.bounces.functions import FunctionWeights
 
 EDGE = 512  # pixels
 KINDS = ("view", "material", "light")  # of frames
+ERRORS = ("frame_error", "picture_error", "direct_error")
 EXPONENTS, _FINE = (200.0, 60.0, 20.0), 40  # of sharp light paths, from the sharpest; edge of their maps in texels
 RAYS = 16  # of mirror images, which scenes have after `with_rays`
 SIZE, BOUNCES = 32, 2  # edge of the light's faces for direct light, and number of bounces
+ORIGINAL, SAMPLES = 256, 64  # edge of the light's faces for Mitsuba, and its samples in each of two pictures
 
 
 class Made(NamedTuple):
@@ -106,12 +113,23 @@ def main(options: Sequence[str] | None = None) -> None:
     if arguments.table:
         print(table([json.loads(line) for line in arguments.table.read_text().splitlines()]))
         return
-    for name in arguments.only or (["walls"] if arguments.quick else RECIPES):
-        published = RECIPES[name].published
-        if arguments.most and published and published.vertices > arguments.most:
-            continue
+    names = arguments.only or (["walls"] if arguments.quick else list(RECIPES))
+    rows = {name: RECIPES[name].published for name in names}
+    if arguments.most:
+        names = [name for name in names if not (row := rows[name]) or row.vertices <= arguments.most]
+    if len(names) > 1:
+        _apart(names, sys.argv[1:] if options is None else options)
+        return
+    for name in names:
         for line in measure(prepare(name, quick=arguments.quick, store=arguments.store), arguments.quick):
             harness.report(line, arguments.output)
+
+
+def _apart(names: Sequence[str], options: Sequence[str]) -> None:
+    """Runs each scene in a process of its own, whose peak of memory is that of one scene."""
+    for name in names:
+        command = [sys.executable, "-m", "benchmarks.paper_scenes", *options, "--only", name]
+        subprocess.run(command, check=True)
 
 
 def prepare(name: str, *, quick: bool = False, store: pathlib.Path | None = None, **options: Any) -> Made:
@@ -151,6 +169,30 @@ def prepare(name: str, *, quick: bool = False, store: pathlib.Path | None = None
     finally:
         seconds, peak = _spent(path and path / f"{marks}_bounces{count}.json", time.perf_counter() - start)
     return Made(name, recipe, scene.with_rays(0), seconds, peak)
+
+
+def models(ready: Made, changed: Look | None = None) -> list[Any]:
+    """BRDFs of all regions, for Mitsuba; `changed` is that of `Made.materials`."""
+    free = ready.materials(changed)
+    names = [part.name for part in ready.scene.scene.parts]
+    return [free.get(name) or Lambert(ready.recipe.fixed[int(name)]) for name in names]
+
+
+def traced(
+    ready: Made,
+    changed: Look | None = None,
+    *,
+    camera: Camera,
+    light: Environment | None = None,
+    bounces: int = BOUNCES,
+    samples: int = SAMPLES,
+) -> Exact:
+    """Mitsuba's pictures of a scene with so many bounces, with the coverage of ours."""
+    light, cover = light_of(ready) if light is None else light, ready.scene.coverage(camera)[..., None]
+    mesh, materials = joined_mesh(ready.scene.shading), models(ready, changed)
+    options = {"depth": 2 + bounces, "samples": samples}
+    halves = (path_tracing.picture(mesh, materials, light, camera, seed=seed, **options) for seed in (0, 1))
+    return Exact(*(np.concatenate([radiance, cover], -1) for radiance in halves))
 
 
 def rms(value: Any) -> float:
@@ -201,6 +243,7 @@ def sharp_path(terms: int) -> paths.Path:
     scale = exact / np.asarray(bounces.functions.albedo(brdf))
     weight = np.zeros((len(EXPONENTS), 2, len(scale)), np.float32)  # of the diffuse channel and of the lobe
     weight[:, 0, -1], weight[:, 1, :-1] = scale[-1], np.diag(scale[:-1])
+    weight *= standard.BLINN_PHONG.scale[:, None]
     knot = -np.log((np.asarray(EXPONENTS) + 2) / 2) / 2  # the logarithm of the roughness of the standard table
     return paths.Path(brdf, FunctionWeights((jnp.asarray(knot, jnp.float32),), jnp.asarray(weight)))
 
@@ -229,6 +272,7 @@ def measure(made: Made, quick: bool) -> Iterator[dict[str, Any]]:
         **{"vertices": made.scene.vertices, "regions": len(made.scene.shading), "adjustable": len(made.recipe.free)},
         **{"bytes": tensor.nbytes, "direct_bytes": direct, "error": rms(tensor.error)},
         "worth": [round(float(each), 4) for each in tensor.worth],
+        **errors(made, quick),
     }
     peer: dict[str, Any] = {}
     if row is not None:
@@ -237,13 +281,31 @@ def measure(made: Made, quick: bool) -> Iterator[dict[str, Any]]:
     spent = {"seconds": made.seconds, "compile_seconds": 0.0, "peak_bytes": made.peak}
     theirs = {"peer_seconds": 3600 * sum(row.hours)} if row else {}
     yield {**common, "case": f"{made.name}, precompute", **spent, **peer, **theirs}
-    for number, (kind, frame) in enumerate(frames(made, quick)):
-        timing = harness.measure(frame, repeats=2 if quick else 9)
+    kinds, functions = zip(*frames(made, quick), strict=True)
+    timings = harness.alternate(functions, repeats=2 if quick else 9)
+    for number, (kind, timing) in enumerate(zip(kinds, timings, strict=True)):
         theirs = {"peer_seconds": 1 / row.fps[number], "peer_fps": row.fps[number]} if row else {}
         yield {
             **{**common, "case": f"{made.name}, frame, new {kind}", **timing.line(), "fps": 1 / timing.seconds},
             **{**peer, **theirs},
         }
+
+
+def errors(made: Made, quick: bool) -> dict[str, float]:
+    """Relative L2 against Mitsuba in the light's own pixels; nothing where it cannot run."""
+    if not path_tracing.available():
+        return {}
+    camera, light = camera_of(made.recipe, made.scene.mesh, edge=32 if quick else EDGE), light_of(made)
+    original = light if quick else light_of(made, size=ORIGINAL)
+    exact = traced(made, camera=camera, light=original)
+    materials = made.materials()
+    color = prt.radiance(made.scene, light, eye=camera.eye, materials=materials)
+    cover = jnp.asarray(made.scene.coverage(camera))[..., None]
+    drawn = {"frame_error": jnp.concatenate([render(made.scene.mesh, color, camera), cover], -1)}
+    rays = made.scene.with_rays(RAYS)
+    for name, scene in (("picture_error", rays), ("direct_error", rays.without_bounces())):
+        drawn[name] = scene.picture(light, camera, materials=materials, background=None)
+    return {name: exact.off(np.asarray(picture)) for name, picture in drawn.items()}
 
 
 def table(lines: Sequence[Mapping[str, Any]]) -> str:
@@ -254,8 +316,8 @@ def table(lines: Sequence[Mapping[str, Any]]) -> str:
     """
     rows = [
         "| scene (the paper's) | vertices | regions, free | precomputation, minutes | storage, MB | peak, GB "
-        "| new view, fps | new material, fps | new light, fps |",
-        "|---" * 9 + "|",
+        "| new view, fps | new material, fps | new light, fps | frame off | picture off | without bounces |",
+        "|---" * 12 + "|",
     ]
     found = {line["case"]: line for line in lines}
     for name in RECIPES:
@@ -273,6 +335,7 @@ def table(lines: Sequence[Mapping[str, Any]]) -> str:
             f"{(first['bytes'] + first['direct_bytes']) / 1e6:.0f}{theirs[2]}",
             f"{first['peak_bytes'] / 1e9:.1f}",
             *(f"{line['fps']:.1f}{fps}" for line, fps in zip(each, theirs[3:], strict=True)),
+            *(f"{100 * first[key]:.1f} %" if key in first else "" for key in ERRORS),
         ]
         rows.append(f"| {title} | " + " | ".join(cells) + " |")
     return "\n".join(rows)
@@ -314,9 +377,9 @@ def _darker(made: Made, amount: float) -> Look:
     return {number: tuple(amount * np.asarray(each, float) for each in look) for number, look in free}  # pyright: ignore
 
 
-def light_of(made: Made) -> Environment:
-    """The light of a scene."""
-    name, size = made.recipe.light, made.scene.surfaces[0].system.texel_edge
+def light_of(made: Made, size: int | None = None) -> Environment:
+    """The light of a scene; in texels of its size, unless another one is given."""
+    name, size = made.recipe.light, size or made.scene.surfaces[0].system.texel_edge
     assert size is not None
     path = harness.data() / "env" / name
     return load_environment(path, size=size) if path.is_file() else builtin.daylight(size=size)

@@ -12,7 +12,7 @@ LLVM, which must be installed; `available` tells. `trace` does without, slowly.
 import math
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +27,35 @@ SAMPLES = (4, 16, 64, 256, 1024)
 _LLVM = 17  # the first that has minima of floats on x86: the process ends where an older one meets them
 _PATHS = 1 << 22  # traced at once: some 200 bytes each
 _ROUGHNESS = {"alpha_u": (2 / 12) ** 0.5, "alpha_v": (2 / 102) ** 0.5}  # of Blinn's distribution with these exponents
+
+
+class Exact(NamedTuple):
+    """Mitsuba's picture as two of independent noise, so that noise does not count as error.
+
+    Attributes:
+        first: One half of the samples.
+        second: The other half.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+
+    @property
+    def picture(self) -> np.ndarray:
+        """The mean of both."""
+        return (self.first + self.second) / 2
+
+    def off(self, mine: np.ndarray, where: np.ndarray | None = None) -> float:
+        """Relative L2 of a picture over some pixels that the scene fills, all if None, without the noise of the halves.
+
+        The mean product of the differences from two pictures of independent noise is the square of the difference from
+        their expectation.
+        """
+        inside = (mine[..., 3] == 1) & (self.first[..., 3] == 1)
+        inside = inside if where is None else inside & where
+        one, other, ours = (picture[inside][:, :3].astype(np.float64) for picture in (self.first, self.second, mine))
+        square, whole = np.sum((ours - one) * (ours - other)), np.sum(one * other)
+        return float(np.sqrt(max(square, 0.0) / whole))
 
 
 def measure(glossy: Mesh, ground: Mesh, lights: dict[str, Environment], eye: np.ndarray, *, quick: bool):
