@@ -49,6 +49,11 @@ def test_figures_without_a_line_other_figures_and_lines_of_gone_figures_are_told
     rows = [{"figure": figure, "from": f"docs/measured/times.md{anchor}"} for figure, anchor in sources.items()]
     text = "".join(json.dumps({"page": "README.md", "place": 1, **row}) + "\n" for row in rows)
     (tmp_path / quoted.REGISTER).write_text(text)
+    for source in ("from memory", "python -m benchmarks.x"):
+        row = {"page": "README.md", "figure": "4 MB", "place": 1, "from": f"here: {source}"}
+        (tmp_path / quoted.REGISTER).write_text(text + json.dumps(row) + "\n")
+        assert any("4 MB" in fault for fault in quoted.faults(tmp_path)) == (source == "from memory")
+    (tmp_path / quoted.REGISTER).write_text(text)
     faults = quoted.faults(tmp_path)
     assert [fault.partition(" (")[0] for fault in faults] == [
         *("README.md: '1,204 ms'", "README.md: '.45 to .5 s'", "README.md: '4 MB'", "README.md no longer has '3 s'")

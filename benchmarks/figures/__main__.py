@@ -24,6 +24,7 @@ FIGURES = {
     "wang2004_figure_3": wang2004.figure_3,
     "wang2004_figure_4": wang2004.figure_4,
     "wang2004_figure_4_bunny": wang2004.figure_4_bunny,
+    "wang2004_varying": wang2004.varying,
     "wang2004_table_2": wang2004.table_2,
 }
 

@@ -30,9 +30,7 @@ def filled(text: str, docs: pathlib.Path) -> str:
     def one(match: re.Match) -> str:
         name = match.group(2)
         path = docs / "lines" / f"{name}.jsonl"
-        if name == "done":
-            body = done(docs)
-        elif path.is_file():
+        if path.is_file():
             shown = [f"![{text}](pictures/{file})" for file, text in PICTURES.get(name, {}).items()]
             table = TABLES[name]([json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()])
             body = "\n\n".join([*shown, table])
@@ -41,12 +39,6 @@ def filled(text: str, docs: pathlib.Path) -> str:
         return f"{match.group(1)}\n{body}\n\n{match.group(3)}"
 
     return _PLACE.sub(one, text)
-
-
-def done(docs: pathlib.Path) -> str:
-    """Which figures have lines."""
-    rows = [[name, "yes" if (docs / "lines" / f"{name}.jsonl").is_file() else "no"] for name in TABLES]
-    return markdown(["figure", "made"], rows)
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
@@ -129,7 +121,7 @@ def kautz_2(lines: Lines) -> str:
 
 
 _NUMBERS = {"norm": 2, "mean": 3, "peak": 2, "inside": 2, "chest": 3, "away": 4, "brighter": 1} | dict.fromkeys(
-    ("blue_over_red", "red_over_blue"), 2
+    ("blue_over_red", "red_over_blue", "red_over_blue_exact"), 2
 )  # digits of radiances and of their ratios
 
 
@@ -195,7 +187,7 @@ def wang_4(lines: Lines) -> str:
         for resolution in dict.fromkeys(line["resolution"] for line in lines):
             mine = [x for x in lines if (x["brdf"], x["resolution"]) == (brdf, resolution)]
             rows.append([brdf, resolution, *(f"{x['rms']:.3g} ({percent(x['relative'], 0)})" for x in mine)])
-    return markdown(["BRDF", "resolution", *(f"{count} terms" for count in counts)], rows)
+    return markdown(["BRDF", "resolution", *(f"{n} term{'s' * (n > 1)}" for n in counts)], rows)
 
 
 TABLES: dict[str, Callable[[Lines], str]] = {
@@ -211,6 +203,7 @@ TABLES: dict[str, Callable[[Lines], str]] = {
     "wang2004_figure_3": chosen("keep", "share", "error", "penumbra_error"),
     "wang2004_figure_4": wang_4,
     "wang2004_figure_4_bunny": chosen("brdf", "light", "terms", "error"),
+    "wang2004_varying": chosen("of_each", "terms", "bytes_of_a_vertex", "error"),
     "wang2004_table_2": lambda lines: wang_table([dict(line) for line in lines]).strip(),
     "sun2007_figure_1": chosen("f0", "m", "sent", "changed", "red_over_blue"),
     "sun2007_figure_4": chosen("material", "component", "share", "norm"),
@@ -219,7 +212,9 @@ TABLES: dict[str, Callable[[Lines], str]] = {
     "sun2007_figure_7": sun_7,
     "sun2007_figure_8": chosen("light", "mean", "peak", "error"),
     "sun2007_figure_11": chosen("picture", "chest", "blue_over_red", "error", "error_whole"),
-    "sun2007_figure_13": chosen("part", "exponent", "changed"),
+    "sun2007_figure_13": chosen(
+        "part", "exponent", "changed", "red_over_blue", "red_over_blue_exact", "error", "error_whole"
+    ),
     "sun2007_caustic": chosen("exponent", "inside", "peak", "error_inside", "error_wall", "error_whole"),
     "sun2007_figure_14": chosen("metal", "m", "sent", "color"),
     "sun2007_figure_15": chosen("picture", "away", "brighter", "error", "error_whole"),
@@ -241,7 +236,7 @@ PICTURES: dict[str, dict[str, str]] = {
         "sun2007_figure_11.jpg": "A bird on blue ground by Mitsuba, in direct light and with two bounces",
     },
     "sun2007_figure_13": {
-        "sun2007_figure_13.jpg": "A dragon on a base: three exponents of the base, and three of the dragon",
+        "sun2007_figure_13.jpg": "A base of three exponents, a dragon of three, and what it sends to the base",
     },
     "sun2007_caustic": {
         "sun2007_caustic.jpg": "A ring of three exponents with its caustic, and by Mitsuba",
@@ -274,7 +269,7 @@ PICTURES: dict[str, dict[str, str]] = {
         "kautz2002_figure_7.jpg": "The Buddha with a Phong lobe, and brushed in two directions",
     },
     "kautz2002_figure_8": {
-        "kautz2002_figure_8.jpg": "Measured paints on a bust, the teapot and the dragon",
+        "kautz2002_figure_8.jpg": "Two models and three measured paints on a bust, the teapot and the dragon",
     },
     "wang2004_figure_1": {
         "wang2004_figure_1.jpg": "The dragon in Uffizi and the bunny in Grace",
@@ -285,6 +280,9 @@ PICTURES: dict[str, dict[str, str]] = {
     "wang2004_figure_4": {
         "wang2004_figure_4_errors.png": "Error by number of terms, for five resolutions",
         "wang2004_figure_4_maps.jpg": "The first eight light maps of the four BRDFs",
+    },
+    "wang2004_varying": {
+        "wang2004_varying.jpg": "A bunny in bands of a matte and two brushed materials: 1, 4 and 16 terms, and exact",
     },
     "wang2004_figure_4_bunny": {
         "wang2004_figure_4_bunny.jpg": "The bunny by four terms of four BRDFs",

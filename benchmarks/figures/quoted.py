@@ -3,10 +3,10 @@
     python -m benchmarks.figures.quoted [--keep]
 
 Pages in docs/measured and docs/figures hold what was measured; other pages quote it. `docs/figures/quoted.jsonl` has
-a line for each quoted figure: its page, the figure, and the section of a measured page that has it, or the command that
-measures it where the page itself is the one place that prints it. The program prints these lines and names figures
-without one, sections that no longer have the figure, and lines of figures that are gone. `--keep` adds lines for new
-figures; write their sections into the file before it is committed.
+a line for each quoted figure: its page, the figure, and the section of a measured page that has it. Where the page
+itself is the one place that prints it, the line has the command that measures it, or how it is computed. The program
+prints these lines and names figures without one, sections that no longer have the figure, and lines of figures that are
+gone. `--keep` adds lines for new figures; write their sources into the file before it is committed.
 """
 
 import argparse
@@ -20,7 +20,9 @@ from typing import NamedTuple
 ROOT = pathlib.Path(__file__).parents[2]
 REGISTER = pathlib.Path("docs/figures/quoted.jsonl")
 MEASURED = ("docs/measured", "docs/figures")
-HERE = "here"  # starts the source of a figure that no other page prints; a command or a reason follows
+HERE = "here: "  # starts the source of a figure that no other page prints; one of these follows:
+_COMMANDS = "python -m ", "make ", "pytest ", "prt."
+_READ = "computed", "an option's ", "a constant ", "the printed ", "the length "
 NOWHERE = "nowhere"  # the source of a new figure, to be replaced by hand
 
 _NUMBER = r"(?<![\w.^])-?(?:\d{1,3}(?:,\d{3})+|\d+)?(?:\.\d+|(?<=\d))"
@@ -122,7 +124,8 @@ def faults(root: pathlib.Path = ROOT) -> list[str]:
         if source is None:
             result.append(f"{name} has no line in {REGISTER}")
         elif source.startswith(HERE):
-            continue
+            if not source.removeprefix(HERE).startswith(_COMMANDS + _READ):
+                result.append(f"{name} has no command: {source!r}")
         elif source not in measured:
             result.append(f"{name} is of {source}, which is not there")
         elif not says(measured[source], figure):

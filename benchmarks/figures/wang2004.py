@@ -1,4 +1,4 @@
-"""Wang, Tran and Luebke 2004: Figures 1, 3 and 4, and Table 2.
+"""Wang, Tran and Luebke 2004: Figures 1, 3 and 4, Table 2, and a surface whose BRDF varies.
 
 The published form: eigenvectors of each color's BRDF matrix on the 48 x 48 disk, 4 terms, 96 wavelet coefficients, and
 light of 6 x 64 x 64 texels. Vertices that a picture shows are relit; the picture interpolates them, as in the paper.
@@ -6,7 +6,7 @@ Errors are relative L2 of the radiance of vertices, against the integral over al
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -28,6 +28,7 @@ from jaxprt.brdf import AshikhminShirley, Lambert, load_lafortune
 from jaxprt.scene import Environment, Mesh, builtin, camera
 from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.sphere import cubemap, directions
+from jaxprt.systems.protocol import Blend
 from jaxprt.systems.separable import SeparableBrdf, SparseTransport
 
 EDGE, TERMS, KEEP = 512, 4, 96
@@ -44,6 +45,7 @@ class Stage:
 
     Attributes:
         whole: Both meshes in one.
+        drawn: What pictures show: both, or the mesh alone if only its vertices are relit.
         view: The camera.
         shown: Numbers of the vertices that the picture shows, of the mesh or of the ground.
         seen: What these see.
@@ -55,6 +57,7 @@ class Stage:
         """Traces what is not in the store."""
         below = ground_plane(mesh, vertices=100 if run.quick else ground)
         self.whole = join([mesh, below])
+        self.drawn = mesh if part == "mesh" else self.whole
         edge = 16 if run.quick else EDGE
         self.view = camera.orbit(mesh, azimuth=azimuth, elevation=0.35, width=edge, height=edge)
         self.view = dataclasses.replace(self.view, field_of_view=wide * self.view.field_of_view)
@@ -72,15 +75,25 @@ class Stage:
         )
 
     def relit(
-        self, factored: SeparableBrdf, light: Environment, number: np.ndarray, keep: int = KEEP
+        self,
+        factored: SeparableBrdf,
+        light: Environment,
+        number: np.ndarray,
+        keep: int = KEEP,
+        *,
+        weight: np.ndarray | None = None,
     ) -> tuple[np.ndarray, int]:
-        """Radiance of some of the shown vertices by sparse transport, and its bytes."""
-        result, size = [], 0
+        """Radiance of some of the shown vertices by sparse transport, and its bytes.
+
+        `weight` has the weights of the BRDF's channels at all shown vertices, [v, k, c].
+        """
+        result, size, eye = [], 0, jnp.asarray(self.view.eye)
         for first in range(0, len(number), _BLOCK):
             part = np.resize(number[first : first + _BLOCK], _BLOCK)
             transport = self.transport(factored, part, keep)
             size += transport.nbytes
-            color = prt.radiance(separable.SeparableSystem(transport, factored), light, eye=jnp.asarray(self.view.eye))
+            system = separable.SeparableSystem(transport, factored)
+            color = prt.radiance(system, light, eye=eye, materials=None if weight is None else Blend(weight[part]))
             result.append(np.asarray(color)[: len(number) - first])
         return np.concatenate(result), size
 
@@ -103,11 +116,11 @@ class Stage:
 
     def draw(self, color: np.ndarray, *, other: Any = 0.0) -> np.ndarray:
         """A picture of the colors of the shown vertices, with its coverage; others have colors of their own."""
-        every = np.zeros((len(self.whole.position), 3), np.float32) + np.asarray(other, np.float32)
+        every = np.zeros((len(self.drawn.position), 3), np.float32) + np.asarray(other, np.float32)
         every[self.shown] = color
-        fragments = image.rasterize(self.whole, self.view, samples=4)
-        pixels = image.shading_points(fragments, self.whole, self.view)
-        colors = image.interpolate(pixels, self.whole.face, jnp.asarray(every))
+        fragments = image.rasterize(self.drawn, self.view, samples=4)
+        pixels = image.shading_points(fragments, self.drawn, self.view)
+        colors = image.interpolate(pixels, self.drawn.face, jnp.asarray(every))
         drawn = np.asarray(image.resolve(pixels, colors))
         return np.concatenate([drawn, 1 - np.asarray(pixels.background)[..., None]], -1)
 
@@ -280,6 +293,62 @@ def figure_4_bunny(run: Run) -> Iterator[dict[str, Any]]:
         captions.append(f"{name}, {light}: {100 * wrong:.0f} % off")
         yield {"brdf": name, "light": light, "error": wrong, "terms": TERMS, "vertices": len(number)}
     drawing.sheet(run.picture("wang2004_figure_4_bunny.jpg"), [pictures], [captions])
+
+
+BASIS = {  # of a surface whose BRDF varies, with the color of each
+    "matte": (Lambert(1.0), (0.05, 0.12, 0.35)),
+    "brushed across": (AshikhminShirley(diffuse=0.0, specular=0.75, nu=10, nv=100), (1.0, 0.75, 0.35)),
+    "brushed along": (AshikhminShirley(diffuse=0.0, specular=0.75, nu=100, nv=10), (0.95, 0.6, 0.5)),
+}
+
+
+def bands(position: np.ndarray) -> np.ndarray:
+    """Weights of `BASIS` [v, k, c]: bands that follow one another from below, with soft edges."""
+    place = (position - position.min(0)) / np.ptp(position, axis=0).max()
+    phase = 22 * (place[:, 1] + 0.06 * np.sin(9 * place[:, 0]) + 0.06 * np.sin(7 * place[:, 2]))
+    share = np.exp(6 * np.cos(phase[:, None] - 2 * np.pi * np.arange(len(BASIS)) / len(BASIS)))
+    share /= share.sum(1, keepdims=True)
+    return (share[..., None] * [color for _, color in BASIS.values()]).astype(np.float32)
+
+
+def side_by_side(factored: Sequence[SeparableBrdf]) -> SeparableBrdf:
+    """The terms of several gray BRDFs, each of which has a channel of its own."""
+    channel = jnp.eye(len(factored))
+    view = [one.view_map * channel[number] for number, one in enumerate(factored)]
+    error = jnp.max(jnp.stack([one.error for one in factored]))
+    return SeparableBrdf(
+        jnp.concatenate([one.light_map for one in factored]), jnp.concatenate(view), error, factored[0].coordinates
+    )
+
+
+def varying(run: Run) -> Iterator[dict[str, Any]]:
+    """The bunny in bands of a matte and two brushed BRDFs: a sum of BRDFs with weights of each vertex, section 3."""
+    stage = Stage(run, "bunny", run.mesh("stanford_bunny.ply"), ground=22_000, azimuth=0.2, part="mesh")
+    number, sky = np.arange(len(stage.shown)), run.light("grace")
+    weight = bands(np.asarray(stage.seen.position))
+    parts = [stage.exact(brdf, sky, number) for brdf, _ in BASIS.values()]
+    exact = np.sum(weight * np.stack(parts, 1), 1)
+    pictures, captions, test = [], [], few(number, run)
+    for count in (1, TERMS, 16):
+        each = [1 if name == "matte" else count for name in BASIS]
+        factored = side_by_side(
+            [
+                factor_symmetric(brdf, terms=terms, resolution=12 if run.quick else 48)
+                for (brdf, _), terms in zip(BASIS.values(), each, strict=True)
+            ]
+        )
+        color, size = stage.relit(factored, sky, number, weight=weight)
+        wrong = off(color[test], exact[test])
+        pictures.append(stage.draw(color))
+        captions.append(f"{count} for each brushed BRDF: {100 * wrong:.0f} % off")
+        yield {"terms": sum(each), "of_each": count, "error": wrong, "bytes_of_a_vertex": size // len(number)}
+    pictures.append(stage.draw(exact))
+    stops = image.automatic_exposure(jnp.asarray(pictures[-1][..., :3]))
+    drawing.sheet(
+        run.picture("wang2004_varying.jpg"),
+        [[drawing.on_white(drawn, stops=stops) for drawn in pictures]],
+        [[*captions, "exact"]],
+    )
 
 
 def table_2(run: Run) -> Iterator[dict[str, Any]]:
