@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from scipy import ndimage
 
 from benchmarks import denoised, harness, path_tracing
 from benchmarks.pictures import BRDFS, LIGHTS, standing
@@ -30,6 +31,7 @@ from jaxprt.scene import (
     Environment,
     Mesh,
     Part,
+    PointLight,
     Scene,
     TexturedMaterial,
     builtin,
@@ -41,6 +43,11 @@ from jaxprt.scene.mesh import ground_plane, make_mesh, split
 
 EDGE, SAMPLES = 384, 256  # pixels along an edge, and paths of each, twice
 _GOLD = TexturedMaterial(base_color=[1.0, 0.766, 0.336], metallic=1.0, roughness=0.3)
+_PANEL = make_mesh(  # nine times as long as high
+    np.array([[-0.9, 0.3, -0.6], [0.9, 0.3, -0.6], [0.9, 0.5, -0.6], [-0.9, 0.5, -0.6]], np.float32),
+    np.array([[0, 1, 2], [0, 2, 3]]),
+)
+_GLOWING = TexturedMaterial(base_color=0.0, metallic=0.0, roughness=1.0, specular=0.0, emissive=[4.0, 4.0, 4.0])
 _MATTE = TexturedMaterial(base_color=0.5, metallic=0.0, roughness=1.0, specular=0.0)
 
 
@@ -196,42 +203,80 @@ def reflected(scene: Scene, light: Environment, camera: Camera) -> tuple[np.ndar
 
 
 def lamp(sizes: Sizes) -> Pictures:
-    """A long panel over a polished floor: it counts as four disks, which show."""
-    floor = builtin.plane(cells=48)
-    across = np.array([[-0.9, 0.3, -0.6], [0.9, 0.3, -0.6], [0.9, 0.5, -0.6], [-0.9, 0.5, -0.6]], np.float32)
-    panel = make_mesh(across, np.array([[0, 1, 2], [0, 2, 3]]))
-    glowing = TexturedMaterial(base_color=0.0, metallic=0.0, roughness=1.0, specular=0.0, emissive=[4.0, 4.0, 4.0])
-    light = Environment(jnp.full((6, 64, 64, 3), 1e-3))
+    """A long panel over a polished floor: it counts as disks, which show."""
     camera = Camera([0.0, 1.0, 2.2], [0.0, 0.0, -0.1], [0.0, 1.0, 0.0], 0.75, sizes.edge, sizes.edge)
-    polished = TexturedMaterial(base_color=0.2, metallic=0.0, roughness=0.2)
-    scene = Scene([Part("floor", floor, polished), Part("panel", panel, glowing)])
-    made = precompute(scene, refine=False, system=Lobes(12), progress=False)
-    exact = lit_by_panel(traced_parts(scene)[0], light, camera)
-    mine = {"four disks": ((lambda: made.picture(light, camera)), memory(made))}
-    return Pictures(mine, exact, inside(scene.mesh, camera))
+    parts = [Part("floor", builtin.plane(cells=48), _polished(0.2)), Part("panel", _PANEL, _GLOWING)]
+    return lit_by_lamps(Scene(parts), camera, {"refine": False}, "disks")
 
 
-def lit_by_panel(floor: tuple[Mesh, Any], light: Environment, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """The floor under the panel of `lamp`, by Mitsuba, with two seeds."""
+def bulb(sizes: Sizes) -> Pictures:
+    """The shadow of a ball in a point light, on a floor of four vertices that shows a highlight."""
+    light = PointLight("bulb", [-0.6, 1.1, -0.5], [2.0, 2.0, 2.0])
+    return lit_by_lamps(Scene(_balls(0.4), point_lights=[light]), _over(sizes), {}, "shadow rays")
+
+
+def panel(sizes: Sizes) -> Pictures:
+    """The half-shadow of a ball before a long panel, on a floor of four vertices that mirrors it."""
+    return lit_by_lamps(Scene([*_balls(0.2), Part("panel", _PANEL, _GLOWING)]), _over(sizes), {}, "shadow rays")
+
+
+def _polished(roughness: float) -> TexturedMaterial:
+    return TexturedMaterial(base_color=0.2, metallic=0.0, roughness=roughness)
+
+
+def _balls(roughness: float) -> list[Part]:
+    """A matte ball on a floor of four vertices."""
+    ball = builtin.sphere(rings=24, sectors=48)
+    ball = make_mesh(0.25 * np.asarray(ball.position) + [0.0, 0.25, 0.0], ball.face, normal=ball.normal)
+    return [Part("floor", builtin.plane(cells=1), _polished(roughness)), Part("ball", ball, _MATTE)]
+
+
+def _over(sizes: Sizes) -> Camera:
+    return Camera([0.3, 1.2, 1.9], [0.0, 0.1, 0.0], [0.0, 1.0, 0.0], 0.75, sizes.edge, sizes.edge)
+
+
+def lit_by_lamps(scene: Scene, camera: Camera, options: dict[str, Any], name: str) -> Pictures:
+    """A scene in the light of its lamps and hardly any other, and by Mitsuba; pixels at a lamp are not judged."""
+    light = Environment(jnp.full((6, 64, 64, 3), 1e-3))
+    made = precompute(scene, system=Lobes(12), progress=False, **options)
+    unlit = Scene([part for part in scene.parts if part.material is not _GLOWING])
+    number = np.asarray(made.picture(light, camera, layers=["part"])["part"])
+    shown = inside(scene.mesh, camera) & np.logical_not(ndimage.binary_dilation(number >= len(unlit.parts)))
+    exact = with_lamps(scene, unlit, light, camera)
+    return Pictures({name: ((lambda: made.picture(light, camera)), memory(made))}, exact, shown)
+
+
+def with_lamps(scene: Scene, unlit: Scene, light: Environment, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Parts that do not glow in the light of `_PANEL`, or of a point light if there is one: by Mitsuba, twice."""
     import mitsuba
 
     from benchmarks import plugins
 
     mitsuba.set_variant("llvm_ad_rgb" if path_tracing.available() else "scalar_rgb")
     place = mitsuba.ScalarTransform4f().translate([0.0, 0.4, -0.6]).scale([0.9, 0.1, 1.0])
-    emitter = {"type": "area", "radiance": {"type": "rgb", "value": 4.0}}
-    mesh, material = floor
-    scene = mitsuba.load_dict(
+    glow = {"type": "area", "radiance": {"type": "rgb", "value": 4.0}}
+    lamps = {"panel": {"type": "rectangle", "to_world": place, "emitter": glow}}
+    if scene.point_lights:
+        (bulb,) = scene.point_lights
+        intensity = {"type": "rgb", "value": np.asarray(bulb.intensity, float).tolist()}
+        lamps = {
+            "bulb": {"type": "point", "position": np.asarray(bulb.position, float).tolist(), "intensity": intensity}
+        }
+    shapes = {
+        f"part{number}": path_tracing.shape(mitsuba, mesh, plugins.bsdf(material), plugins.attributes(material))
+        for number, (mesh, material) in enumerate(traced_parts(unlit))
+    }
+    world = mitsuba.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "direct", "hide_emitters": False},
             "sensor": path_tracing.sensor(mitsuba, camera),
             "light": {"type": "envmap", "bitmap": mitsuba.Bitmap(path_tracing.latlong(light))},
-            "panel": {"type": "rectangle", "to_world": place, "emitter": emitter},
-            "floor": path_tracing.shape(mitsuba, mesh, plugins.bsdf(material), plugins.attributes(material)),
+            **lamps,
+            **shapes,
         }
     )
-    one, other = (np.array(mitsuba.render(scene, spp=SAMPLES, seed=mitsuba.UInt32(seed))) for seed in (1, 2))
+    one, other = (np.array(mitsuba.render(world, spp=SAMPLES, seed=mitsuba.UInt32(seed))) for seed in (1, 2))
     return one, other
 
 
@@ -254,6 +299,8 @@ CASES = {
     "metal": metal,
     "caustic": caustic,
     "lamp": lamp,
+    "bulb": bulb,
+    "panel": panel,
 }
 
 
