@@ -33,9 +33,10 @@ def _iterate(apply: Callable, size: int, terms: int, steps: int, dtype) -> tuple
     def grow(carry, item):
         basis, image, fresh = carry
         place, noise = item
-        # Random vectors replace products that add nothing to the span. Projecting twice is then enough.
+        # Random vectors replace products that add nothing to the span. The first projection leaves rounding of those,
+        # which may lie in the span; after three all vectors are orthogonal to it.
         fresh = _normalize(fresh) + 10 * jnp.finfo(dtype).eps * _normalize(noise)
-        for _ in range(2):
+        for _ in range(3):
             fresh = _orthonormal(fresh - basis @ (basis.T @ fresh))
         product = apply(fresh)
         basis, image = (

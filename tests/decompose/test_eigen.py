@@ -137,3 +137,14 @@ def test_orientation_makes_one_basis_of_all_that_rounding_may_choose_and_keeps_d
         again = basis @ turn
         np.testing.assert_allclose(again @ eigen.orientation(value, again), expected, atol=1e-12)
     np.testing.assert_allclose(np.abs(expected.T @ basis)[[0, 4, 5]], np.eye(6)[[0, 4, 5]], atol=1e-12)
+
+
+@pytest.mark.parametrize(("size", "rank", "least", "sweeps"), [(200, 4, 0.1, 8), (384, 30, 0.01, 3)])
+def test_more_sweeps_than_the_rank_needs_keep_all_of_a_matrix(size, rank, least, sweeps):
+    rng, residuals = np.random.default_rng(0), []
+    for _ in range(8):
+        left, right = (np.linalg.qr(rng.standard_normal((count, rank)))[0] for count in (size, rank))
+        matrix = jnp.asarray((left * np.geomspace(0.5, least, rank)) @ right.T, jnp.float32)
+        residuals.append(eigen.left_singular(matrix, terms=rank, steps=sweeps)[2])
+    # Measured 1e-6. By two projections up to 4.5e-6 here, and 5.6e-3 by jaxlib 0.12 on a matrix of clustered transport.
+    assert np.max(residuals) < 2e-6
