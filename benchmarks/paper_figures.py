@@ -333,10 +333,8 @@ class Figures:
             lines.append(line)
         pale = (0.5, 0.0, 20.0)
         dark = {0: (0.0, 0.0, 20.0), 1: pale}
-        black, unlit = self.layers(ready, dark, light=light, camera=camera), None
-        base = black.region(1)
-        if self.compare:
-            unlit = self.mitsuba(ready, dark, light=light, camera=camera)
+        black = self.layers(ready, dark, light=light, camera=camera)
+        base, unlit = black.region(1), self.mitsuba(ready, dark, light=light, camera=camera)
         for n in SHININESS:
             look = {0: (RECIPES["airplane"].free[0][0], 0.6, n), 1: pale}
             color = self.layers(ready, look, light=light, camera=camera, rays=paper_scenes.RAYS).color

@@ -114,9 +114,8 @@ def main(options: Sequence[str] | None = None) -> None:
         print(table([json.loads(line) for line in arguments.table.read_text().splitlines()]))
         return
     names = arguments.only or (["walls"] if arguments.quick else list(RECIPES))
-    rows = {name: RECIPES[name].published for name in names}
     if arguments.most:
-        names = [name for name in names if not (row := rows[name]) or row.vertices <= arguments.most]
+        names = [name for name in names if not (row := RECIPES[name].published) or row.vertices <= arguments.most]
     if len(names) > 1:
         _apart(names, sys.argv[1:] if options is None else options)
         return
