@@ -345,7 +345,7 @@ def _trace_shares(address, scene, origin, direction, point, way, share):
     context, arguments = np.empty(16, np.int64), np.empty(4, np.int64)
     _empty_context(context, arguments, _PASSED)
     context[_FIELD] = share.ctypes.data
-    ray, valid = packets.ray_buffers(12)
+    ray, valid = packets.ray_buffers()
     for packet in range(0, len(point), 16):
         count = min(16, len(point) - packet)
         for lane in range(16):
@@ -383,7 +383,7 @@ def _trace_blocked(origin, direction, point, way, share):
 def _first(address, scene, origin, direction, face, part, distance, weight):
     context, arguments = np.empty(16, np.int64), np.empty(4, np.int64)
     _empty_context(context, arguments, _FIRST)
-    ray, valid = packets.ray_buffers(24)
+    ray, valid = packets.ray_buffers()
     number = ray.view(np.uint32)
     for packet in range(0, len(origin), 16):
         count = min(16, len(origin) - packet)
@@ -413,7 +413,7 @@ def _collect(address, scene, origin, direction, far, hidden, count, place, face,
     context[_FIELD], context[_FIELD + 1] = count.ctypes.data, place.ctypes.data
     context[_FIELD + 2], context[_FIELD + 3] = face.ctypes.data, alpha.ctypes.data
     context[_FIELD + 4] = hidden.ctypes.data
-    ray, valid = packets.ray_buffers(24)
+    ray, valid = packets.ray_buffers()
     number = ray.view(np.uint32)
     for packet in range(0, len(direction), 16):
         rays = min(16, len(direction) - packet)

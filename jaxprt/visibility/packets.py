@@ -243,21 +243,23 @@ def callback(signature: Any, function: Callable) -> Any:
 
 @no_type_check  # Run-time type checks would wrap the function, and numba could not cache it on disk.
 @numba_loop
-def ray_buffers(rows):
+def ray_buffers():
     """Memory of a packet, aligned to 64 bytes: rows of sixteen values, and which rays are valid.
 
-    RTCRay16 has 12 rows, RTCRayHit16 24.
+    RTCRayHit16 has 21 rows. RTCRay16 has 12, but on processors without native packets of sixteen rays Embree's
+    `rtcOccluded16` reads all 21 rows and writes them back: with room for 12 it undoes what other threads have written
+    behind them meanwhile.
     """
-    memory = np.empty((rows + 1) * 16 + 16, np.float32)
+    memory = np.empty(25 * 16 + 16, np.float32)
     first = (-memory.ctypes.data // 4) % 16
-    last = first + rows * 16
-    return memory[first:last].reshape(rows, 16), memory[last : last + 16].view(np.int32)
+    last = first + 24 * 16
+    return memory[first:last].reshape(24, 16), memory[last : last + 16].view(np.int32)
 
 
 @no_type_check
 @numba_loop
 def _trace_blocked(address, scene, arguments, origin, direction, point, way, result):
-    ray, valid = ray_buffers(12)
+    ray, valid = ray_buffers()
     for packet in range(0, len(point), 16):
         count = min(16, len(point) - packet)
         for lane in range(16):
@@ -339,7 +341,7 @@ def trace_shares(query, surface, points, texels, first, last, share):
     pattern = points[3]
     direction, middle, count, shift = texels
     strata = direction.shape[1]
-    ray, valid = ray_buffers(12)
+    ray, valid = ray_buffers()
     origin, facing = np.zeros((4, 3, 16), np.float32), np.zeros((3, 16), np.float32)
     above, visible = np.empty(16, np.bool_), np.empty(16)
     step = np.empty(len(count), np.int64)  # between turns, so that the first ones are spread over the texel
@@ -590,7 +592,7 @@ def trace_lamps(query, surface, points, fields, lamps, first, last, result):
         result: The integrals of 1, of the cosine, and of the direction.
     """
     pieces, most = lamps[4], lamps[4].max()
-    ray, valid = ray_buffers(12)
+    ray, valid = ray_buffers()
     memory = ray, valid, np.zeros(16, np.float32), np.zeros((6, 16), np.float32)
     origin, pattern = np.zeros((4, 3, 16), np.float32), np.zeros(16, np.int64)
     center, normal = np.zeros((3, 16), np.float32), np.zeros((3, 16), np.float32)
