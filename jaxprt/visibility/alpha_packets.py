@@ -1,4 +1,4 @@
-"""Rays through surfaces with holes and translucent ones, in packets of sixteen, by filter functions of Embree.
+"""Rays through surfaces with holes and translucent ones, in packets, by filter functions of Embree.
 
 Embree calls the filter for each hit on a surface that is not opaque. The filter looks up the opacity where the ray hits
 and refuses hits where light passes.
@@ -54,7 +54,7 @@ class AlphaPackets:
     ):
         embree = packets.library()
         if embree is None:
-            raise RuntimeError("surfaces with holes need the Embree library of embreex 4, with packets of 16 rays")
+            raise RuntimeError("surfaces with holes need the Embree library of embreex 4, with packets of rays")
         self._occluded, self._intersect = embree.occluded, embree.intersect
         layer = np.asarray(opacity.layer)[face[:, 0]]
         opaque, clear = np.flatnonzero((layer == 0) & (not clear_only)), np.flatnonzero(layer > 0)
@@ -89,7 +89,7 @@ class AlphaPackets:
         return _trace_blocked(origin, direction, point, way, share)
 
     @property
-    def query(self) -> tuple[int, int, np.ndarray, np.ndarray, np.ndarray]:
+    def query(self) -> tuple[tuple[int, int], int, np.ndarray, np.ndarray, np.ndarray]:
         """What queries of shares need; see `packets.Packets.query`."""
         passed, context, arguments = np.ones(packets.WIDTH, np.float32), np.empty(16, np.int64), np.empty(4, np.int64)
         _empty_context(context, arguments, _PASSED)
@@ -341,11 +341,12 @@ def _no_hit(ray):
 
 @no_type_check
 @numba_loop
-def _trace_shares(address, scene, origin, direction, point, way, share):
+def _trace_shares(entry, scene, origin, direction, point, way, share):
     context, arguments = np.empty(16, np.int64), np.empty(4, np.int64)
     _empty_context(context, arguments, _PASSED)
     context[_FIELD] = share.ctypes.data
-    ray, valid = packets.ray_buffers()
+    buffers = packets.ray_buffers()
+    ray, valid, _ = buffers
     for packet in range(0, len(point), 16):
         count = min(16, len(point) - packet)
         for lane in range(16):
@@ -355,7 +356,7 @@ def _trace_shares(address, scene, origin, direction, point, way, share):
                 ray[axis, lane] = origin[point[at], axis]
                 ray[4 + axis, lane] = direction[way[at], axis]
             packets.begin(ray, lane, at, 1e37)
-        packets.call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
+        packets.trace(entry, scene, arguments.ctypes.data, buffers, 12)
         for lane in range(count):
             if ray[8, lane] < 0:
                 share[packet + lane] = 0.0
@@ -380,10 +381,11 @@ def _trace_blocked(origin, direction, point, way, share):
 
 @no_type_check
 @numba_loop
-def _first(address, scene, origin, direction, face, part, distance, weight):
+def _first(entry, scene, origin, direction, face, part, distance, weight):
     context, arguments = np.empty(16, np.int64), np.empty(4, np.int64)
     _empty_context(context, arguments, _FIRST)
-    ray, valid = packets.ray_buffers()
+    buffers = packets.ray_buffers()
+    ray, valid, _ = buffers
     number = ray.view(np.uint32)
     for packet in range(0, len(origin), 16):
         count = min(16, len(origin) - packet)
@@ -395,7 +397,7 @@ def _first(address, scene, origin, direction, face, part, distance, weight):
                 ray[4 + axis, lane] = direction[at, axis]
             packets.begin(ray, lane, at, 1e37)
         _no_hit(ray)
-        packets.call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
+        packets.trace(entry, scene, arguments.ctypes.data, buffers, 24)
         for lane in range(count):
             at = packet + lane
             distance[at] = ray[8, lane]
@@ -407,13 +409,14 @@ def _first(address, scene, origin, direction, face, part, distance, weight):
 
 @no_type_check
 @numba_loop
-def _collect(address, scene, origin, direction, far, hidden, count, place, face, alpha):
+def _collect(entry, scene, origin, direction, far, hidden, count, place, face, alpha):
     context, arguments = np.empty(16, np.int64), np.empty(4, np.int64)
     _empty_context(context, arguments, _LAYERS)
     context[_FIELD], context[_FIELD + 1] = count.ctypes.data, place.ctypes.data
     context[_FIELD + 2], context[_FIELD + 3] = face.ctypes.data, alpha.ctypes.data
     context[_FIELD + 4] = hidden.ctypes.data
-    ray, valid = packets.ray_buffers()
+    buffers = packets.ray_buffers()
+    ray, valid, _ = buffers
     number = ray.view(np.uint32)
     for packet in range(0, len(direction), 16):
         rays = min(16, len(direction) - packet)
@@ -425,7 +428,7 @@ def _collect(address, scene, origin, direction, far, hidden, count, place, face,
                 ray[4 + axis, lane] = direction[at, axis]
             packets.begin(ray, lane, at, far[at])
         _no_hit(ray)
-        packets.call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
+        packets.trace(entry, scene, arguments.ctypes.data, buffers, 24)
         for lane in range(rays):
             at = packet + lane
             if number[18, lane] == np.uint32(0xFFFFFFFF):

@@ -1,9 +1,11 @@
-"""Shadow rays in packets of sixteen, traced by the Embree library that embreex ships.
+"""Shadow rays in packets, traced by the Embree library that embreex ships.
 
-embreex traces rays one at a time. Sixteen rays with nearby origins and similar directions visit the same nodes of
-Embree's BVH. Traced as a packet they are faster and give identical results.
+embreex traces rays one at a time. Rays with nearby origins and similar directions visit the same nodes of Embree's BVH.
+Traced as a packet they are faster and give identical results.
 
-`jaxprt.visibility.picture_rays` explains the method. The loops run over sixteen points at a time.
+`jaxprt.visibility.picture_rays` explains the method. The loops run over sixteen points at a time, on every processor.
+`trace` gives Embree their rays in packets of the processor's own width: 16 with AVX-512, 8 with AVX, 4 otherwise.
+Embree traces wider ones ray by ray.
 """
 
 import ctypes
@@ -25,6 +27,8 @@ from numba.extending import intrinsic
 from jaxprt.compile import numba_loop
 
 WIDTH = 16
+_NATIVE = {16: 34, 8: 33, 4: 32}  # widths of packets, and the properties that tell whether Embree traces them as such
+_ROWS = 24  # RTCRayHit has 21 values for each ray
 # From embree4/include/embree4/rtcore_*.h.
 _ROBUST = 1 << 2
 _TRIANGLES = 0
@@ -40,6 +44,7 @@ _ENOUGH = 48  # rays of a packet that tell, if they agree, that others would agr
 _POINTER, _INT, _UINT, _SIZE = ctypes.c_void_p, ctypes.c_int, ctypes.c_uint, ctypes.c_size_t
 _PROTOTYPES = {
     "rtcNewDevice": (_POINTER, [ctypes.c_char_p]),
+    "rtcGetDeviceProperty": (_SIZE, [_POINTER, _INT]),
     "rtcNewScene": (_POINTER, [_POINTER]),
     "rtcSetSceneFlags": (None, [_POINTER, _INT]),
     "rtcNewGeometry": (_POINTER, [_POINTER, _INT]),
@@ -62,7 +67,7 @@ _TINY = 1e-36  # smallest squared distance
 
 
 class Packets:
-    """An Embree scene of triangles, for `rtcOccluded16`.
+    """An Embree scene of triangles, for shadow rays.
 
     Args:
         position: Vertex positions.
@@ -85,14 +90,14 @@ class Packets:
         self._arguments = np.array([COHERENT | EVERY_FEATURE << 32, self._context.ctypes.data, 0, 0], np.uint64)
 
     @property
-    def query(self) -> tuple[int, int, np.ndarray, np.ndarray, np.ndarray]:
-        """Address of `rtcOccluded16`, the scene, the arguments, their context, and sixteen numbers.
+    def query(self) -> tuple[tuple[int, int], int, np.ndarray, np.ndarray, np.ndarray]:
+        """Embree's function for shadow rays, the scene, the arguments, their context, and sixteen numbers.
 
         Filter functions multiply the number of a ray by the share of light that surfaces on it let pass. Opaque ones
         leave it as it is. Each thread needs a query of its own.
         """
         arrays = self._arguments.view(np.int64), self._context.view(np.int64)
-        return int(self._occluded or 0), int(self._scene), *arrays, np.ones(WIDTH, np.float32)
+        return self._occluded, int(self._scene), *arrays, np.ones(WIDTH, np.float32)
 
     def blocked(
         self,
@@ -112,15 +117,31 @@ class Embree(NamedTuple):
 
     Attributes:
         functions: The library.
-        occluded: Address of `rtcOccluded16`.
-        intersect: Address of `rtcIntersect16`.
         device: A device.
+        occluded: Address of `rtcOccluded4`, `rtcOccluded8` or `rtcOccluded16`, and the number of rays that it takes.
+        intersect: The same for `rtcIntersect4`, `rtcIntersect8` or `rtcIntersect16`.
     """
 
     functions: ctypes.CDLL
-    occluded: int
-    intersect: int
     device: int
+    occluded: tuple[int, int]
+    intersect: tuple[int, int]
+
+    @classmethod
+    def on(cls, functions: ctypes.CDLL, config: bytes | None = None) -> "Embree | None":
+        """A new device; None if there is no memory for one.
+
+        Args:
+            functions: The library.
+            config: Embree's options, such as `b"isa=avx2"`.
+        """
+        device = functions.rtcNewDevice(config)
+        if device is None:
+            return None
+        width = next((width for width, name in _NATIVE.items() if functions.rtcGetDeviceProperty(device, name)), 4)
+        queries = (getattr(functions, f"{query}{width}") for query in ("rtcOccluded", "rtcIntersect"))
+        occluded, intersect = ((ctypes.cast(query, _POINTER).value or 0, width) for query in queries)
+        return cls(functions, device, occluded, intersect)
 
 
 def new_scene(owner: object) -> int:
@@ -202,23 +223,21 @@ def library() -> Embree | None:
             continue
         try:
             functions = ctypes.CDLL(str(file.locate()))
-            queries = functions.rtcOccluded16, functions.rtcIntersect16
-            occluded, intersect = (ctypes.cast(query, _POINTER).value or 0 for query in queries)
             for name, (result, arguments) in _PROTOTYPES.items():
                 function = getattr(functions, name)
                 function.restype, function.argtypes = result, arguments
+            embree = Embree.on(functions)
         except (OSError, AttributeError):
             continue
-        device = functions.rtcNewDevice(None)
-        if device is not None:
-            return Embree(functions, occluded, intersect, device)
+        if embree is not None:
+            return embree
     return None
 
 
 @no_type_check
 @intrinsic
-def call(typing, address, valid, scene, ray, arguments):
-    """Calls void (*)(const int*, RTCScene, RTCRay16*, RTCOccludedArguments*), or `rtcIntersect16`, at an address.
+def _call(typing, address, valid, scene, ray, arguments):
+    """Calls void (*)(const int*, RTCScene, RTCRayN*, RTCOccludedArguments*), or `rtcIntersectN`, at an address.
 
     The address is an argument, rather than a ctypes function, so that numba can cache the compiled code on disk.
     """
@@ -244,22 +263,66 @@ def callback(signature: Any, function: Callable) -> Any:
 @no_type_check  # Run-time type checks would wrap the function, and numba could not cache it on disk.
 @numba_loop
 def ray_buffers():
-    """Memory of a packet, aligned to 64 bytes: rows of sixteen values, and which rays are valid.
+    """Memory of sixteen rays, aligned to 64 bytes: rows of sixteen values, which rays are valid, and of one packet.
 
-    RTCRayHit16 has 21 rows. RTCRay16 has 12, but on processors without native packets of sixteen rays Embree's
-    `rtcOccluded16` reads all 21 rows and writes them back: with room for 12 it undoes what other threads have written
-    behind them meanwhile.
+    The packet always has room for RTCRayHit, also where the function takes RTCRay, which has 12 values for each ray.
+    For a width that is not native to the processor Embree's `rtcOccluded16` reads and writes back all 21: with room for
+    12 it undoes what other threads have written behind them meanwhile.
     """
-    memory = np.empty(25 * 16 + 16, np.float32)
+    memory = np.empty(2 * (_ROWS + 1) * 16 + 16, np.float32)
     first = (-memory.ctypes.data // 4) % 16
-    last = first + 24 * 16
-    return memory[first:last].reshape(24, 16), memory[last : last + 16].view(np.int32)
+    ray = memory[first : first + _ROWS * 16].reshape(_ROWS, 16)
+    valid = memory[first + _ROWS * 16 : first + (_ROWS + 1) * 16].view(np.int32)
+    return ray, valid, memory[first + (_ROWS + 1) * 16 : first + 2 * (_ROWS + 1) * 16]
 
 
 @no_type_check
 @numba_loop
-def _trace_blocked(address, scene, arguments, origin, direction, point, way, result):
-    ray, valid = ray_buffers()
+def trace(entry, scene, arguments, buffers, rows):
+    """Traces the valid ones of sixteen rays.
+
+    Args:
+        entry: Address of one of Embree's functions, and the number of rays that it takes.
+        scene: The scene.
+        arguments: Address of the function's arguments.
+        buffers: The rays, from `ray_buffers`.
+        rows: Number of values of each ray: 12 for RTCRay, 24 for RTCRayHit.
+    """
+    address, width = entry
+    ray, valid, packet = buffers
+    if width == 16:
+        _call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
+    elif width == 8:
+        _trace_parts(address, scene, arguments, ray, valid, packet, rows, 8)
+    else:
+        _trace_parts(address, scene, arguments, ray, valid, packet, rows, 4)
+
+
+@no_type_check
+@numba.njit(inline="always")
+def _trace_parts(address, scene, arguments, ray, valid, packet, rows, width):
+    chosen = packet[_ROWS * width :].view(np.int32)
+    for first in range(0, 16, width):
+        some = 0
+        for lane in range(width):
+            chosen[lane] = valid[first + lane]
+            some |= chosen[lane]
+        if some == 0:
+            continue
+        for row in range(rows):
+            for lane in range(width):
+                packet[row * width + lane] = ray[row, first + lane]
+        _call(address, chosen.ctypes.data, scene, packet.ctypes.data, arguments)
+        for row in range(8, rows):  # before it stand the origin and the direction
+            for lane in range(width):
+                ray[row, first + lane] = packet[row * width + lane]
+
+
+@no_type_check
+@numba_loop
+def _trace_blocked(entry, scene, arguments, origin, direction, point, way, result):
+    buffers = ray_buffers()
+    ray, valid, _ = buffers
     for packet in range(0, len(point), 16):
         count = min(16, len(point) - packet)
         for lane in range(16):
@@ -269,7 +332,7 @@ def _trace_blocked(address, scene, arguments, origin, direction, point, way, res
                 ray[axis, lane] = origin[point[at], axis]
                 ray[4 + axis, lane] = direction[way[at], axis]
         whole_ray(ray)
-        call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments)
+        trace(entry, scene, arguments, buffers, 12)
         for lane in range(count):
             result[packet + lane] = ray[8, lane] < 0
 
@@ -337,11 +400,12 @@ def trace_shares(query, surface, points, texels, first, last, share):
         last: Index after the last point.
         share: The result, in 255ths [t, p].
     """
-    address, scene, arguments, _, passed = query
+    entry, scene, arguments, _, passed = query
     pattern = points[3]
     direction, middle, count, shift = texels
     strata = direction.shape[1]
-    ray, valid = ray_buffers()
+    buffers = ray_buffers()
+    ray, valid, _ = buffers
     origin, facing = np.zeros((4, 3, 16), np.float32), np.zeros((3, 16), np.float32)
     above, visible = np.empty(16, np.bool_), np.empty(16)
     step = np.empty(len(count), np.int64)  # between turns, so that the first ones are spread over the texel
@@ -375,7 +439,7 @@ def trace_shares(query, surface, points, texels, first, last, share):
                         ray[4 + axis, lane] = direction[texel, stratum, axis]
                 whole_ray(ray)
                 passed[:] = 1.0
-                call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
+                trace(entry, scene, arguments.ctypes.data, buffers, 12)
                 for lane in range(lanes):
                     visible[lane] += passed[lane] if above[lane] and ray[8, lane] > 0 else 0.0
                 traced += 1
@@ -484,8 +548,9 @@ def _cast(query, memory, lamps, aim, origin, sight, weight, free):
     Adds the irradiance from each place to `weight` of its piece, and to `free` that from visible places.
     """
     number, spot, piece = aim
-    address, scene, arguments, _, passed = query
-    ray, valid, cosine, goal = memory
+    entry, scene, arguments, _, passed = query
+    buffers, cosine, goal = memory
+    ray, valid, _ = buffers
     center, normal, facing, least = sight
     place, area = lamps[0], lamps[1]
     whole_ray(ray)
@@ -510,7 +575,7 @@ def _cast(query, memory, lamps, aim, origin, sight, weight, free):
         valid[lane] = -1 if cosine[lane] > zero and above > zero else 0
     passed[:] = 1
     if valid.min() < 0:
-        call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
+        trace(entry, scene, arguments.ctypes.data, buffers, 12)
     rays, open_ = 0, 0
     for lane in range(16):
         seen = valid[lane] != 0 and ray[8, lane] > zero
@@ -592,8 +657,7 @@ def trace_lamps(query, surface, points, fields, lamps, first, last, result):
         result: The integrals of 1, of the cosine, and of the direction.
     """
     pieces, most = lamps[4], lamps[4].max()
-    ray, valid = ray_buffers()
-    memory = ray, valid, np.zeros(16, np.float32), np.zeros((6, 16), np.float32)
+    memory = ray_buffers(), np.zeros(16, np.float32), np.zeros((6, 16), np.float32)
     origin, pattern = np.zeros((4, 3, 16), np.float32), np.zeros(16, np.int64)
     center, normal = np.zeros((3, 16), np.float32), np.zeros((3, 16), np.float32)
     facing = np.zeros((3, 16), np.float32)
