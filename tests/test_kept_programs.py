@@ -1,6 +1,7 @@
 """Programs survive the process: other processes load them, and whatever is wrong with a file means compiling."""
 
 import inspect
+import io
 import json
 import logging
 import os
@@ -206,20 +207,137 @@ def test_unfinished_files_of_processes_that_ended_are_deleted(files):
     assert sorted(path.name for path in files.folder.iterdir()) == [".new-young", "name", "other"]
 
 
-@pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
+posix = pytest.mark.skipif(os.name != "posix", reason="links, pipes and permissions of POSIX")
+
+
+@posix
 def test_folders_and_files_that_others_may_write_are_not_trusted(files, caplog):
     files.write("name", b"content")
     (files.folder / "name").chmod(0o622)
     assert files.read("name") is None
     (files.folder / "name").chmod(0o600)
-    files.folder.chmod(0o777)
-    assert files.read("name") is None
-    files.write("other", b"content")
-    assert files.read("name") is None
+    for mode in (0o770, 0o1777, 0o777):
+        files.folder.chmod(mode)
+        assert files.read("name") is None
+        files.write("other", b"content")
     assert [record.getMessage() for record in caplog.records] == [
         f"compiled programs are not kept: other users may write into {files.folder}; chmod 700 makes it private"
     ]
     assert [path.name for path in files.folder.iterdir()] == ["name"]
+
+
+@posix
+@pytest.mark.parametrize(("mode", "trusted"), [(0o755, True), (0o1777, True), (0o777, False), (0o775, False)])
+@pytest.mark.parametrize("above", [0, 1, 2])
+def test_every_folder_above_is_private_or_sticky(mode, trusted, above, tmp_path, caplog):
+    files = Store(tmp_path / "cache" / "jaxprt" / "programs")
+    files.write("name", b"content")
+    path = files.folder.parents[above]
+    path.chmod(mode)
+    assert files.read("name") == (b"content" if trusted else None)
+    Store(path / "new" / "programs").write("name", b"content")
+    assert (path / "new").exists() == trusted
+    fault = f"other users may write into {path}; chmod go-w makes it private"
+    assert set(caplog.messages) == (set() if trusted else {f"compiled programs are not kept: {fault}"})
+
+
+@posix
+@pytest.mark.parametrize(("mode", "trusted"), [(0o755, True), (0o1777, False), (0o777, False)])
+def test_a_link_counts_where_nobody_else_may_make_one(mode, trusted, tmp_path):
+    planted = Store(tmp_path / "repository" / "jaxprt" / "programs")
+    planted.write("name", b"planted")
+    (tmp_path / "cache").mkdir()
+    (tmp_path / "cache" / "user").symlink_to("../repository")
+    (tmp_path / "cache").chmod(mode)
+    files = Store(tmp_path / "cache" / "user" / "jaxprt" / "programs")
+    assert files.read("name") == (b"planted" if trusted else None)
+    files.write("other", b"content")
+    assert (planted.folder / "other").exists() == trusted
+
+
+@posix
+@pytest.mark.parametrize("link", ["jaxprt", "jaxprt/programs"])
+def test_links_in_place_of_the_folder_are_not_followed(link, tmp_path, caplog):
+    planted = Store(tmp_path / "repository" / "jaxprt" / "programs")
+    planted.write("name", b"planted")
+    path = tmp_path / "cache" / link
+    path.parent.mkdir(parents=True)
+    path.symlink_to(tmp_path / "repository" / link)
+    files = Store(tmp_path / "cache" / "jaxprt" / "programs")
+    assert files.read("name") is None
+    files.write("other", b"content")
+    assert [file.name for file in planted.folder.iterdir()] == ["name"]
+    assert caplog.messages == [f"compiled programs are not kept: {path} is a symbolic link"]
+
+
+def sparse(path, _):
+    with path.open("wb") as file:
+        file.truncate(8 << 30)
+
+
+@posix
+@pytest.mark.parametrize(
+    "plant",
+    [
+        lambda path, other: path.symlink_to(other),
+        lambda path, other: path.hardlink_to(other),
+        lambda path, _: os.mkfifo(path, 0o600),
+        lambda path, _: path.symlink_to("/dev/zero"),
+        sparse,
+    ],
+    ids=["link", "hard link", "pipe", "device", "8 GB"],
+)
+def test_whatever_else_stands_in_place_of_a_file_is_not_read_and_gives_way(plant, files, tmp_path):
+    files.write("name", b"content")
+    (files.folder / "name").rename(tmp_path / "planted")
+    plant(files.folder / "name", tmp_path / "planted")
+    assert files.read("name") is None
+    files.write("name", b"new")
+    assert files.read("name") == b"new"
+    assert (tmp_path / "planted").read_bytes().endswith(b"content")
+
+
+@pytest.mark.skipif(getattr(os, "geteuid", lambda: 1)() != 0, reason="only root may give folders away")
+@pytest.mark.parametrize("above", [0, 1, 2])
+def test_folders_above_belong_to_root_or_the_user(above, tmp_path, caplog):
+    files = Store(tmp_path / "cache" / "jaxprt" / "programs")
+    files.write("name", b"content")
+    path = files.folder.parents[above]
+    os.chown(path, 12_345, 0)
+    assert files.read("name") is None
+    assert caplog.messages == [f"compiled programs are not kept: {path} belongs to another user"]
+
+
+@pytest.mark.parametrize("content", [None, "", "processor : 0\n", "vendor_id : A\nmodel : 1\nflags :\n"])
+def test_a_processor_that_the_system_does_not_name_keeps_nothing(content, untouched, monkeypatch, caplog):
+    def read(*_, **__):
+        if content is None:
+            raise PermissionError
+        return io.StringIO(content)
+
+    assert store.is_enabled()
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(store, "open", read, raising=False)
+    monkeypatch.setattr(store, "processor", inspect.unwrap(store.processor))
+    monkeypatch.setattr(store, "_warn", inspect.unwrap(store._warn))
+    assert store.processor() == ""
+    jax_cache.install()
+    assert not jax_cache.active()
+    assert caplog.messages[0] == "compiled programs are not kept: the system does not name the processor"
+
+
+def test_two_processors_have_two_names(monkeypatch):
+    text = "vendor_id : A\nmodel : {}\nflags : avx {}\n\nprocessor : 1\n"
+    monkeypatch.setattr(sys, "platform", "linux")
+    names = set()
+    for model in (1, 2):
+        for flag in ("avx2", "avx512f"):
+            monkeypatch.setattr(
+                store, "open", lambda *_, m=model, f=flag, **__: io.StringIO(text.format(m, f)), raising=False
+            )
+            names.add(inspect.unwrap(store.processor)())
+    assert len(names) == 4
+    assert "" not in names
 
 
 def test_folders_and_homes_of_another_user_are_left_alone(files, monkeypatch):

@@ -64,7 +64,7 @@ def process_store() -> Store:
 
 def install() -> None:
     """Gives JAX the cache, unless programs are not wanted, or the user or a program has configured JAX's own."""
-    if not is_enabled() or any(name.startswith(_VARIABLES) for name in os.environ) or _is_configured():
+    if any(name.startswith(_VARIABLES) for name in os.environ) or _is_configured() or not is_enabled():
         return
     with compilation_cache._cache_initialized_mutex:
         if compilation_cache._cache_initialized:

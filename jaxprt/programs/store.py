@@ -1,9 +1,9 @@
 """Files of compiled programs in a folder of the user's cache.
 
 A process that loads a program runs code from its file. The folder must therefore belong to the user, and nobody else
-may write into it. Files start with a checksum of their name and content, so that a damaged file counts as absent. New
-files appear by renaming, so that other processes see whole files only. Nothing here raises an error: a program that
-cannot be kept is compiled again.
+may write into it or replace a folder on the way to it. Files start with a checksum of their name and content, so that a
+damaged file counts as absent. New files appear by renaming, so that other processes see whole files only. Nothing here
+raises an error: a program that cannot be kept is compiled again.
 """
 
 import contextlib
@@ -13,6 +13,7 @@ import logging
 import os
 import pathlib
 import platform
+import re
 import stat
 import subprocess
 import sys
@@ -31,8 +32,8 @@ log = logging.getLogger("jaxprt")
 
 
 def is_enabled() -> bool:
-    """Whether programs are kept: not if the environment variable JAXPRT_KEEP_PROGRAMS is 0."""
-    return os.environ.get("JAXPRT_KEEP_PROGRAMS", "1") != "0"
+    """Whether programs are kept: not if JAXPRT_KEEP_PROGRAMS is 0, nor for a processor that cannot be named."""
+    return os.environ.get("JAXPRT_KEEP_PROGRAMS", "1") != "0" and bool(processor())
 
 
 def folder() -> pathlib.Path:
@@ -49,16 +50,25 @@ def folder() -> pathlib.Path:
 
 @functools.cache
 def processor() -> str:
-    """The processor's model and instruction sets: programs of one processor may crash on another."""
-    words = [platform.machine(), platform.processor()]
-    with contextlib.suppress(OSError):
+    """The processor's model and instruction sets: programs of one processor may crash on another.
+
+    It is empty, and one line says so, where the system does not tell them: the architecture alone names no processor.
+    """
+    facts = ""
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
         if sys.platform == "darwin":
-            words.append(subprocess.check_output(["/usr/sbin/sysctl", "-n", "machdep.cpu.brand_string"], text=True))
+            facts = subprocess.check_output(["/usr/sbin/sysctl", "-n", "machdep.cpu.brand_string"], text=True).strip()
+        elif sys.platform == "win32":
+            facts = platform.processor()
         else:
-            with open("/proc/cpuinfo") as file:
+            with open("/proc/cpuinfo", errors="replace") as file:
                 first = file.read(1 << 15).split("\n\n")[0]
-            words += [line for line in first.split("\n") if line.startswith(_FEATURES)]
-    return "\n".join(words)
+            if re.search(r"^(flags|Features)\s*:.*\w", first, re.MULTILINE):
+                facts = "\n".join(line for line in first.split("\n") if line.startswith(_FEATURES))
+    if not facts:
+        _warn("the system does not name the processor")
+        return ""
+    return f"{platform.machine()}\n{facts}"
 
 
 class Store:
@@ -81,22 +91,28 @@ class Store:
         try:
             if not _is_trusted(self.folder):
                 return None
-            with path.open("rb") as file:
-                if not _private(os.fstat(file.fileno())):
+            with open(path, "rb", opener=_open_file) as file:
+                status = os.fstat(file.fileno())
+                if not _is_own_file(status) or status.st_size > self._largest:
                     return None
-                content = file.read()
+                content = file.read(status.st_size)
             if content[:_DIGEST] != _digest(name, content[_DIGEST:]):
                 path.unlink()
                 return None
             with contextlib.suppress(OSError):  # a folder that can be read only
                 os.utime(path)
-        except OSError:
+        except (OSError, MemoryError):
             return None
         return content[_DIGEST:]
 
+    @property
+    def _largest(self) -> int:
+        """Bytes of the largest file."""
+        return int(self.most * (1 - _LEFT))
+
     def write(self, name: str, content: bytes) -> None:
         """Writes a file. After a failure, such as a full disk, this process writes no more files."""
-        if not self._writable or len(content) > self.most * (1 - _LEFT):
+        if not self._writable or _DIGEST + len(content) > self._largest:
             return
         try:
             self._writable = _make_folder(self.folder)
@@ -147,11 +163,23 @@ def _replace(path: pathlib.Path, content: bytes) -> None:
         raise
 
 
+def _open_file(path: str, flags: int) -> int:
+    """Opens a file, but neither a link nor, which would wait for its other end, a pipe."""
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
+
+
 def _make_folder(folder: pathlib.Path) -> bool:
-    """Creates the folder if it is absent, in a folder of the user, and says whether it can be trusted."""
-    if not folder.exists():
-        parent = next(parent for parent in folder.parents if parent.exists())
-        if not folder.is_absolute() or not _is_owner(parent.stat()):  # for example the home of the user who called sudo
+    """Creates the folder if it is absent, and says whether it can be trusted.
+
+    It is created in a folder of the user, or where everybody may create folders, as in /tmp.
+    """
+    if not os.path.lexists(folder):
+        parent = next(parent for parent in folder.parents if os.path.lexists(parent))
+        status = parent.stat()
+        if not (_is_owner(status) or status.st_mode & stat.S_ISVTX):  # for example a folder of the user who called sudo
+            return False
+        if fault := _fault(parent, private=False):
+            _warn(fault)
             return False
         for directory in (*reversed(folder.parents), folder):
             directory.mkdir(mode=0o700, exist_ok=True)
@@ -159,21 +187,62 @@ def _make_folder(folder: pathlib.Path) -> bool:
 
 
 def _is_trusted(folder: pathlib.Path) -> bool:
-    status = folder.stat()
-    if _is_owner(status) and not _private(status):
-        _warn_of(folder)
-    return stat.S_ISDIR(status.st_mode) and _private(status)
+    fault = _fault(folder)
+    if fault:
+        _warn(fault)
+    return not fault
+
+
+def _fault(folder: pathlib.Path, *, private: bool = True) -> str:
+    """Why another user may decide what is in a folder; empty if only root and the user may.
+
+    It goes down from the root. Nobody else can replace an entry of a folder that has passed, nor one of root or the
+    user in a folder like /tmp. Therefore nothing that has passed can change before a file is opened. Links count where
+    nobody else can create any, but the last two folders must be none.
+
+    Args:
+        folder: An absolute path.
+        private: Whether the last two folders are jaxprt's own.
+
+    Raises:
+        OSError: The folder does not exist.
+    """
+    if not folder.is_absolute() or not stat.S_ISDIR(folder.stat().st_mode):
+        return f"{folder} is not the absolute path of a folder"
+    if os.name != "posix":
+        return ""
+    path, rest, shared = pathlib.Path(), list(reversed(folder.parts)), False
+    while rest:
+        path /= rest.pop()
+        status, last = path.lstat(), private and not rest
+        if not (_is_owner(status) or (status.st_uid == 0 and not last)):
+            return f"{path} belongs to another user"
+        if stat.S_ISLNK(status.st_mode):
+            if shared or (private and len(rest) < 2):
+                return f"{path} is a symbolic link"
+            rest += reversed(pathlib.Path(os.readlink(path)).parts)
+            path = path.parent
+            continue
+        shared = not _unshared(status)
+        if shared and (last or not status.st_mode & stat.S_ISVTX):
+            return f"other users may write into {path}; chmod {'700' if last else 'go-w'} makes it private"
+    return ""
 
 
 @functools.cache
-def _warn_of(folder: pathlib.Path) -> None:
-    log.warning("compiled programs are not kept: other users may write into %s; chmod 700 makes it private", folder)
+def _warn(fault: str) -> None:
+    log.warning("compiled programs are not kept: %s", fault)
 
 
 def _is_owner(status: os.stat_result) -> bool:
     return not hasattr(os, "geteuid") or status.st_uid == os.geteuid()
 
 
-def _private(status: os.stat_result) -> bool:
-    """Whether a file or folder belongs to the user, and nobody else may write into it."""
-    return _is_owner(status) and (os.name != "posix" or not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
+def _unshared(status: os.stat_result) -> bool:
+    """Whether nobody but the owner may write into a file or folder."""
+    return os.name != "posix" or not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+
+
+def _is_own_file(status: os.stat_result) -> bool:
+    """Whether it is a file of the user, of one name, into which nobody else may write."""
+    return stat.S_ISREG(status.st_mode) and _is_owner(status) and _unshared(status) and status.st_nlink <= 1
