@@ -155,7 +155,7 @@ def isolated(function: Callable, *, static: tuple[str, ...] = ()) -> Callable:
 
 
 def numba_loop(function: Callable, **options: Any) -> Callable:
-    """Compiles a loop by numba, on disk too where the package's folder or the user's cache can be written.
+    """Compiles a loop by numba. Later processes load what this one has compiled.
 
     Args:
         function: The loop. It releases the global interpreter lock.
@@ -163,10 +163,9 @@ def numba_loop(function: Callable, **options: Any) -> Callable:
     """
     import numba  # takes half a second
 
-    try:
-        return numba.njit(nogil=True, cache=True, **options)(function)
-    except RuntimeError:  # no folder to write to
-        return numba.njit(nogil=True, **options)(function)
+    from jaxprt.programs import loops
+
+    return loops.keep(numba.njit(nogil=True, **options)(function))
 
 
 def finished(result: PyTree, between: Between) -> PyTree:

@@ -43,8 +43,8 @@ RUNG = {system: number for number, rung in enumerate(LADDER) for system in rung}
 ONLY_IN = {
     "click": "jaxprt.cli",
     "embreex": "jaxprt.visibility.occluder",
-    "numba": ("jaxprt.visibility", "jaxprt.compile"),
-    "llvmlite": "jaxprt.visibility.packets",
+    "numba": ("jaxprt.visibility", "jaxprt.compile", "jaxprt.programs.loops"),
+    "llvmlite": ("jaxprt.visibility.packets", "jaxprt.programs.loops"),
     "OpenEXR": "jaxprt.files",
     "OpenImageIO": "jaxprt.files",
     "mmap": "jaxprt.files.arrays",

@@ -1,5 +1,6 @@
 """Programs survive the process: other processes load them, and whatever is wrong with a file means compiling."""
 
+import importlib
 import inspect
 import io
 import json
@@ -16,15 +17,20 @@ from typing import Any
 import equinox
 import jax
 import jax.numpy as jnp
+import numba
 import numpy as np
 import pytest
 from jax._src import compilation_cache
+from numba.core import types as numba_types
+from numba.core.caching import NullCache
 
 from jaxprt import Camera
-from jaxprt.compile import kept
+from jaxprt.compile import kept, numba_loop
 from jaxprt.image import raster
-from jaxprt.programs import executables, jax_cache, store
+from jaxprt.programs import executables, jax_cache, loops, store
 from jaxprt.programs.store import Store
+from jaxprt.scene import panorama_loops
+from jaxprt.visibility import alpha_packets, packets
 
 ROOT = pathlib.Path(__file__).parents[1]
 axes = inspect.unwrap(raster.view_axes)  # a small function of a camera
@@ -323,6 +329,7 @@ def test_a_processor_that_the_system_does_not_name_keeps_nothing(content, untouc
     assert store.processor() == ""
     jax_cache.install()
     assert not jax_cache.active()
+    assert isinstance(vars(loops.keep(numba.njit(doubled)))["_cache"], NullCache)
     assert caplog.messages[0] == "compiled programs are not kept: the system does not name the processor"
 
 
@@ -561,3 +568,99 @@ def test_names_tell_values_apart():
     assert len({executables.describe(each) for each in values}) == len(values)
     structures = [jax.tree.structure(each) for each in (camera(), camera(width=5), (1,), [1], {"a": 1}, None)]
     assert len({executables.describe(each) for each in structures}) == len(structures)
+
+
+@pytest.fixture
+def loop_files(monkeypatch, files):
+    """Loops of numba are kept in a folder of the test."""
+    monkeypatch.setattr(loops, "is_enabled", lambda: True)  # benchmarks turn it off
+    monkeypatch.setattr(loops, "process_store", lambda: files)
+    return files
+
+
+def test_a_later_process_loads_a_loop_unless_something_that_it_reads_has_changed(loop_files, monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    (tmp_path / "kept_loop.py").write_text("""
+import kept_constants
+import numpy as np
+from jaxprt.compile import numba_loop
+from kept_constants import SCALE, shift
+
+@numba_loop
+def last(x):
+    return x + kept_constants.LAST
+
+@numba_loop
+def loop(x):
+    return last(SCALE * shift(x) + kept_constants.TABLE[1] + np.float32(0))
+""")
+    text = """
+import numpy as np
+from jaxprt.compile import numba_loop
+
+SCALE, TABLE, STEP, LAST, UNREAD = 2.0, np.array([0.0, 10.0]), 1, 0.0, 7
+
+@numba_loop
+def shift(x):
+    return x + STEP
+"""
+
+    def compute(text):
+        """The value of the loop at 1 in new modules, and whether it was loaded."""
+        (tmp_path / "kept_constants.py").write_text(text)
+        for name in ("kept_loop", "kept_constants"):
+            sys.modules.pop(name, None)
+        importlib.invalidate_caches()
+        loop = importlib.import_module("kept_loop").loop
+        return loop(1.0), loop.stats.cache_hits.total() == 1
+
+    assert compute(text) == (14.0, False)
+    assert compute(text) == (14.0, True)
+    assert compute(text.replace("7", "8")) == (14.0, True)
+    assert compute(text.replace("2.0", "3.0")) == (16.0, False)
+    assert compute(text.replace("10.0", "20.0")) == (24.0, False)
+    assert compute(text.replace("1, 0.0", "2, 0.0")) == (16.0, False)
+    assert compute(text.replace("1, 0.0", "1, 5.0")) == (19.0, False)
+    assert compute(text.replace("x + STEP", "x - STEP")) == (10.0, False)
+    assert compute(text) == (14.0, True)
+    for path in loop_files.folder.iterdir():
+        loop_files.write(path.name, b"no pickle")
+    assert compute(text) == (14.0, False)
+    loop_files.folder.chmod(0o777)
+    assert compute(text) == (14.0, os.name != "posix")
+
+
+def test_every_loop_of_the_package_is_kept_under_a_name_of_its_own(loop_files, monkeypatch):
+    modules = packets, alpha_packets, panorama_loops
+    every = [value for module in modules for value in vars(module).values() if hasattr(value, "_cache")]
+    assert len(every) > 30
+    assert len({loops.describe(loop) for loop in every}) == len(every)
+    before = loops.describe(alpha_packets._filter)
+    monkeypatch.setattr(alpha_packets, "_CLEAR", 2 * alpha_packets._CLEAR)  # which `_alpha` reads, and `_filter` calls
+    assert loops.describe(alpha_packets._filter) != before
+
+
+def test_a_function_that_c_calls_is_kept_too(loop_files):
+    for hits in (0, 1):
+        twice = packets.callback(numba_types.float64(numba_types.float64), doubled)
+        assert twice.ctypes(4.0) == 8
+        assert twice.cache_hits == hits
+
+
+def doubled(x):
+    """Twice a number."""
+    return 2 * x
+
+
+def test_one_line_turns_it_off_for_loops(monkeypatch):
+    monkeypatch.setenv("JAXPRT_KEEP_PROGRAMS", "0")
+    loop = numba_loop(doubled)
+    assert isinstance(vars(loop)["_cache"], NullCache)
+    assert loop(2.0) == 4
+
+
+@pytest.mark.parametrize("value", [object(), {"a": 1}, np.array([None]), Camera])
+def test_loops_that_read_values_of_other_kinds_are_not_kept(value):
+    with pytest.raises(executables.UnnamedError):
+        loops.describe(value)

@@ -18,13 +18,15 @@ from pathlib import Path
 from typing import Any, NamedTuple, no_type_check
 
 import llvmlite.ir
-import numba
 import numpy as np
 from jaxtyping import Bool, Float32, Integer
 from numba.core import types
+from numba.core.ccallback import CFunc
+from numba.core.sigutils import normalize_signature
 from numba.extending import intrinsic
 
 from jaxprt.compile import numba_loop
+from jaxprt.programs import loops
 
 WIDTH = 16
 _NATIVE = {16: 34, 8: 33, 4: 32}  # widths of packets, and the properties that tell whether Embree traces them as such
@@ -254,10 +256,9 @@ def _call(typing, address, valid, scene, ray, arguments):
 
 def callback(signature: Any, function: Callable) -> Any:
     """A function that C calls, compiled by numba as `numba_loop` compiles; its address is `address`."""
-    try:
-        return numba.cfunc(signature, cache=True)(function)
-    except RuntimeError:
-        return numba.cfunc(signature)(function)
+    compiled = loops.keep(CFunc(function, normalize_signature(signature), {}, {}))
+    compiled.compile()
+    return compiled
 
 
 @no_type_check  # Run-time type checks would wrap the function, and numba could not cache it on disk.
