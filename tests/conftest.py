@@ -20,6 +20,8 @@ from typing import Any
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).parents[1] / ".pytest_cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+# Benchmarks turn kept programs off, and their tests run in these processes: loops of numba would be compiled in each.
+os.environ.setdefault("JAXPRT_KEEP_PROGRAMS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # Its threads, in jax's QR, wait by spinning beside other processes.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # of no use here, and 3 % of the time
 # Compiled without optimization tests take half the processor time. XLA_FLAGS="" tests what users get. Splitting small

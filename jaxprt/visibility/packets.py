@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, no_type_check
 
 import llvmlite.ir
+import numba
 import numpy as np
 from jaxtyping import Bool, Float32, Integer
 from numba.core import types
