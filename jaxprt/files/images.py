@@ -605,6 +605,9 @@ def _quoted(start: bytes) -> str:
 def _read_other(
     path: pathlib.Path, name: str, form: str, *, decoded: bool | None
 ) -> tuple[Float32[np.ndarray, "h w c"], dict[str, typing.Any]]:
+    damage = pixels.png_damage(inputs.content(path, "an image file"), name) if form == "png" else ""
+    if damage:
+        raise ValueError(f"{name} must be an undamaged png file, got {damage}")
     config = OpenImageIO.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)  # Otherwise colors come premultiplied by alpha.
     reader = OpenImageIO.ImageInput.open(str(path), config)

@@ -2,6 +2,7 @@
 
 import pathlib
 import struct
+import zlib
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -25,6 +26,10 @@ _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0
 _SRGB_IN_ICC = np.array([[0.4361, 0.2225, 0.0139], [0.3851, 0.7169, 0.0971], [0.1431, 0.0606, 0.7141]])
 # Profiles of sRGB differ by up to 0.006; those of Display P3 and Adobe RGB by 0.08 and more.
 _NEAR = 0.02
+_PNG_DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}  # bits, by color type
+_PNG_LONGEST = 10**6  # pixels along an edge
+# First column and row of each pass of an interlaced PNG file, and the steps between its columns and rows.
+_ADAM7 = (0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2)
 _SRGB_HALF = ((0.5 + 0.055) / 1.055) ** 2.4
 
 
@@ -328,3 +333,88 @@ def _png_chunks(start: bytes) -> dict[bytes, bytes]:
         chunk[name] = start[place + 8 : place + 8 + size]
         place += 12 + size
     return chunk
+
+
+def png_damage(content: bytes, name: str) -> str:
+    """Why libpng cannot read a PNG file; empty if it can. libpng itself prints the reason on the standard error.
+
+    Args:
+        content: The file.
+        name: Name of the file in messages.
+
+    Raises:
+        ValueError: There are more pixels than `check_size` allows.
+        MemoryError: The pixels do not fit into memory.
+
+    Reference: PNG specification, third edition, sections 5, 7, 9 and 11.2.
+    """
+    chunk, damage = _needed_chunks(content)
+    if damage:
+        return damage
+    header, data = chunk[b"IHDR"], chunk[b"IDAT"]
+    if len(header) != 13:
+        return f"a header of {len(header)} bytes, which must have 13"
+    width, height, depth, color, *methods, interlaced = struct.unpack(">2I5B", header)
+    if depth not in _PNG_DEPTHS.get(color, ()) or any(methods) or interlaced > 1:
+        return f"depth {depth}, color type {color} and methods {[*methods, interlaced]}, which no PNG file has"
+    palette = len(chunk.get(b"PLTE", b""))
+    if color == 3 and (not 0 < palette <= 768 or palette % 3):
+        return f"a palette of {palette} bytes, which must have 3 for each of 1 to 256 colors"
+    check_size(name, height, width)
+    if max(width, height) > _PNG_LONGEST:
+        return f"{width} x {height} pixels (width x height), which must have edges of at most {_PNG_LONGEST}"
+    channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}[color]
+    # The compressed bytes, and the scan lines with the filter of each.
+    check_memory(name, height, width, channels, decoder=len(data) + height * (width * depth * channels // 8 + 2))
+    return _scanline_damage(data, width, height, depth * channels, interlaced=bool(interlaced))
+
+
+def _needed_chunks(content: bytes) -> tuple[dict[bytes, bytes], str]:
+    """The chunks without which a PNG file cannot be read, those of one kind joined; and what is wrong with them.
+
+    libpng reads on to the end of the file after the pixels only where they are interlaced.
+    """
+    chunk: dict[bytes, bytes] = {}
+    place, pixels = 8, []
+    while not pixels or content[place + 4 : place + 8] == b"IDAT" or chunk[b"IHDR"][12:] == b"\1":
+        size, kind = int.from_bytes(content[place : place + 4], "big"), content[place + 4 : place + 8]
+        body, end = content[place + 8 : place + 8 + size], place + 12 + size
+        if len(content) < end or not kind.isalpha() or kind[2] & 32:  # the third letter is a capital
+            return chunk, f"a file that is cut off or damaged at byte {place}"
+        if not kind[0] & 32:  # a capital: the chunk is needed
+            if (kind == b"IHDR") != (place == 8) or kind not in (b"IHDR", b"PLTE", b"IDAT", b"IEND") or kind in chunk:
+                return chunk, f"a chunk {kind.decode()} at byte {place}, which no PNG file has there"
+            if kind != b"IEND" and zlib.crc32(kind + body) != int.from_bytes(content[end - 4 : end], "big"):
+                return chunk, f"a chunk {kind.decode()} at byte {place} with a wrong checksum"
+            if kind == b"IEND":
+                break
+            if kind == b"IDAT":
+                pixels.append(body)
+            else:
+                chunk[kind] = body
+        elif place == 8:
+            return chunk, "a file that does not start with IHDR"
+        place = end
+    return chunk | {b"IDAT": b"".join(pixels)}, ""
+
+
+def _scanline_damage(data: bytes, width: int, height: int, bits: int, *, interlaced: bool) -> str:
+    """Why the scan lines of a PNG file, with so many bits for each pixel, cannot be read; empty if they can."""
+    passes = _ADAM7 if interlaced else ((0, 0, 1, 1),)
+    sizes = [(-(-(height - y) // down), -(-(width - x) // across)) for x, y, across, down in passes]
+    lines = [(rows, 1 + -(-columns * bits // 8)) for rows, columns in sizes if rows > 0 and columns > 0]
+    total = sum(rows * length for rows, length in lines)
+    unpack = zlib.decompressobj()
+    try:
+        value = np.frombuffer(unpack.decompress(data, total), np.uint8)
+        complete = len(value) == total and (unpack.decompress(unpack.unconsumed_tail, 1) or unpack.eof)
+    except zlib.error as error:
+        return f"pixels that cannot be unpacked: {error}"
+    if not complete:
+        return f"{len(value)} bytes of pixels and no end of them, which must have {total}"
+    first = 0
+    for rows, length in lines:
+        if (value[first : first + rows * length : length] > 4).any():
+            return "scan lines of an unknown filter"
+        first += rows * length
+    return ""
