@@ -6,9 +6,19 @@ import json
 import os
 import pathlib
 import stat
+import unicodedata
+from collections.abc import Callable
 from typing import Any
 
 from jaxprt import require
+
+_SHOWN = 400  # characters of a name in messages; what is longer is data
+
+
+def shortened(text: object) -> str:
+    """A name or a path for a message, without the middle of a very long one, such as a URI that holds data."""
+    words = str(text)
+    return words if len(words) <= _SHOWN else f"{words[: _SHOWN // 2]}...{words[-_SHOWN // 4 :]}"
 
 
 def check(path: pathlib.Path, what: str) -> None:
@@ -26,15 +36,26 @@ def check(path: pathlib.Path, what: str) -> None:
     try:
         mode = path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise FileNotFoundError(f"{path} must be {what}, and there is no such file") from error
+        raise FileNotFoundError(f"{shortened(path)} must be {what}, and there is no such file") from error
     except ValueError as error:  # a null character
-        raise ValueError(f"{str(path)!r} must be the path of {what}, got one that no file can have") from error
+        raise ValueError(f"{shortened(path)!r} must be the path of {what}, got one that no file can have") from error
     except OSError as error:
         if error.errno not in (errno.ENAMETOOLONG, errno.ELOOP):
             raise
         raise ValueError(f"{str(path)[:200]!r} must be the path of {what}, got one with {error.strerror}") from error
     if not stat.S_ISREG(mode):
         raise ValueError(f"{path} must be {what}, got a {'directory' if stat.S_ISDIR(mode) else 'special file'}")
+
+
+def absence(path: pathlib.Path) -> str:
+    """Why a path is not that of a regular file; empty if it is."""
+    try:
+        check(path, "a file")
+    except FileNotFoundError:
+        return "which does not exist"
+    except ValueError:
+        return "which is not a regular file"
+    return ""
 
 
 def check_unlinked(path: pathlib.Path, what: str) -> None:
@@ -89,12 +110,12 @@ def require_inside(path: pathlib.Path, folder: pathlib.Path, *, owner: str, outs
     try:
         target, home = path.resolve(), folder.resolve()
     except (OSError, ValueError, RuntimeError) as error:  # a null character, or links in a circle
-        raise ValueError(f"{owner} must refer to a file, got {str(path)!r}: {error}") from error
+        raise ValueError(f"{owner} must refer to a file, got {shortened(path)!r}: {shortened(error)}") from error
     if not target.is_relative_to(home):
         raise ValueError(
-            f"{owner} must refer to files in the folder of the scene, {home}, got {target}, which is outside of it: "
-            "move the file into the folder or, if you trust the scene, call load_scene(path, outside=True) or give "
-            "--outside to the command"
+            f"{owner} must refer to files in the folder of the scene, {home}, got {shortened(target)}, "
+            "which is outside of it: move the file into the folder or, if you trust the scene, call "
+            "load_scene(path, outside=True) or give --outside to the command"
         )
     return path
 
@@ -137,7 +158,8 @@ def reference(name: str, base: pathlib.Path, *, folder: pathlib.Path, owner: str
     r"""The path of a file that a scene names, with the checks of `require_inside`.
 
     A \ belongs to the name, or separates folders, as on Windows, if there is no file of that name. Both paths must be
-    inside.
+    inside. If there is no file of either name, but one in the folder of the scene whose name differs only in the case
+    of letters or in its Unicode form, that is meant: other systems do not distinguish these.
 
     Args:
         name: Name of the file in the scene.
@@ -151,4 +173,44 @@ def reference(name: str, base: pathlib.Path, *, folder: pathlib.Path, owner: str
     """
     on_windows = require_inside(base / name.replace("\\", "/"), folder, owner=owner, outside=outside)
     path = require_inside(base / name, folder, owner=owner, outside=outside)
-    return path if os.path.lexists(path) else on_windows
+    if os.path.lexists(path):
+        return path
+    other = (
+        None if os.path.lexists(on_windows) else _other_spelling(path, folder) or _other_spelling(on_windows, folder)
+    )
+    return on_windows if other is None else require_inside(other, folder, owner=owner, outside=outside)
+
+
+def _other_spelling(path: pathlib.Path, folder: pathlib.Path) -> pathlib.Path | None:
+    """The path in a folder that differs from another in case and Unicode form alone; None unless there is one.
+
+    Folders outside are not searched: what a link to one leads to keeps its spelling.
+    """
+    try:
+        here = home = folder.resolve()
+        parts = path.resolve().relative_to(home).parts
+        for number, part in enumerate(parts):
+            if not here.resolve().is_relative_to(home):
+                return here.joinpath(*parts[number:])
+            if not os.path.lexists(here / part):
+                part = _same_name(part, os.listdir(here))
+                if part is None:
+                    return None
+            here = here / part
+    except (OSError, ValueError, RuntimeError):  # outside, a null character, links in a circle, or no folder
+        return None
+    return here
+
+
+def _same_name(name: str, names: list[str]) -> str | None:
+    """The only one of some names that equals another but for its Unicode form, or else for that and its case."""
+    forms: tuple[Callable[[str], str], ...] = (_composed, lambda text: _composed(_composed(text).casefold()))
+    for form in forms:
+        same = [other for other in names if form(other) == form(name)]
+        if same:
+            return same[0] if len(same) == 1 else None
+    return None
+
+
+def _composed(text: str) -> str:
+    return unicodedata.normalize("NFC", text)

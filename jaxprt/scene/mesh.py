@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Integer
 
 from jaxprt import require
 from jaxprt.scene import origin as origins
-from jaxprt.scene.formats.geometry import Geometry, rows_of
+from jaxprt.scene.formats.geometry import Geometry, has_area, rows_of
 from jaxprt.sphere import directions
 
 BLEND = -1.0  # in place of a cutoff, for surfaces that stop the share alpha
@@ -247,7 +247,12 @@ def from_file(geometry: Geometry, path: pathlib.Path) -> Mesh:
     """A mesh from the geometry of a file, with the normals and checks of `load_mesh`."""
     frame, welded = (geometry.normal, geometry.tangent), path.suffix.lower() != ".stl"
     fields = geometry.position, geometry.face, *frame, geometry.region, geometry.texture
-    return _make(*fields, name=str(path), welded=welded)
+    mesh = _make(*fields, name=str(path), welded=welded)
+    count = len(geometry.face)
+    blocks = (geometry.face[first : first + _BLOCK] for first in range(0, count, _BLOCK))
+    if not any(has_area(geometry.position, block).any() for block in blocks):
+        raise ValueError(f"{path} must hold faces with an area, got {count} faces without: nothing of them is visible")
+    return mesh
 
 
 def make_mesh(

@@ -1,7 +1,8 @@
 """Parts of scenes from files: images of textures, materials of files that have none, and one mesh for each material."""
 
 import pathlib
-from collections.abc import Sequence
+import warnings
+from collections.abc import Collection, Sequence
 
 import equinox as eqx
 import jax
@@ -18,6 +19,19 @@ from jaxprt.scene.mesh import Mesh, brush, from_file, split
 from jaxprt.scene.scene import Part, unique_names
 
 _GRAY = 0.5  # base color of surfaces without material and color
+
+
+def warn_of_ignored(source: object, ignored: Collection[str], *, stacklevel: int) -> None:
+    """Warns once of all that a file holds and that is not read; of nothing if there is nothing.
+
+    Args:
+        source: The file.
+        ignored: What is not read. Very long names are shortened.
+        stacklevel: That of `warnings.warn`, from the caller.
+    """
+    if ignored:
+        listed = ", ".join(sorted(map(inputs.shortened, ignored)))
+        warnings.warn(f"{source}: not supported and ignored are {listed}", stacklevel=stacklevel + 1)
 
 
 class TextureImages:

@@ -13,6 +13,8 @@ _BLOCK = 1 << 18  # corners that are tested at once, to bound the memory
 _CLIPPED = 2000  # corners of a polygon up to which ear clipping ends within .1 s, whatever crosses
 _LINES = 32  # along which edges of larger polygons are tested, for each of two directions
 _REVERSED = 1e-9  # area of a triangle of the other orientation, relative to the squared size, that is rounding error
+_ROUNDED = 64 * np.finfo(np.float64).eps  # height of a triangle that is rounding error, relative to its coordinates
+_FLAT = 1e-12  # volume of a unit cube below which a transform has flattened it
 _DISPLAY_MOST = 255.0  # largest value in files that write the whole numbers of 8-bit colors as other types
 _PAINTED_MOST = 2.0  # largest float that counts as a color above white, such as 1 and rounding
 
@@ -115,6 +117,31 @@ def instances(geometry: Geometry, matrices: np.ndarray) -> list[Geometry]:
 def cofactors(linear: np.ndarray) -> np.ndarray:
     """Cofactor matrices of linear maps [n 3 3], which transform normals, also where a map is singular."""
     return np.cross(linear[:, [1, 2, 0]], linear[:, [2, 0, 1]])
+
+
+def flat(matrices: np.ndarray) -> np.ndarray:
+    """Whether affine transforms [n 4 4] map space to a plane, a line or a point [n]."""
+    linear = matrices[:, :3, :3]
+    size = np.abs(linear).max((1, 2), keepdims=True)
+    with np.errstate(invalid="ignore"):  # meshes refuse positions that are not finite
+        return ~(np.abs(np.linalg.det(linear / np.where(size > 0, size, 1))) > _FLAT)
+
+
+def has_area(position: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """Whether triangles [f 3] have more area than rounding errors in float64 give them [f]."""
+    corner = position[face]
+    with np.errstate(over="ignore", invalid="ignore"):  # meshes refuse positions that are not finite
+        edge = np.roll(corner, -1, 1) - corner
+        area = np.linalg.norm(np.cross(edge[:, 0], edge[:, 1]), axis=1)
+        length = np.linalg.norm(edge, axis=2).max(1)
+        return ~(area <= _ROUNDED * np.abs(corner).max((1, 2)) * length)
+
+
+def with_area(geometry: Geometry) -> Geometry:
+    """A geometry without triangles that have no area, and without vertices that no other triangle has."""
+    used, face = np.unique(geometry.face[has_area(geometry.position, geometry.face)], return_inverse=True)
+    fields = {name: value for name, value in geometry._asdict().items() if value is not None and name != "face"}
+    return Geometry(face=face.reshape(-1, 3), **{name: value[used] for name, value in fields.items()})
 
 
 def split_corners(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -177,7 +177,7 @@ def content(path: pathlib.Path, *, groups: bool) -> MeshContent:
     """Reads a PLY, OBJ, STL or OFF file with its colors and the names of its images."""
     suffix = path.suffix.lower()
     if suffix == ".obj":
-        return MeshContent(obj.read(path, groups=groups), [], set())
+        return obj.read(path, groups=groups)
     read_content = _READERS[suffix](path)
     geometry = read_content.geometry
     region = np.zeros(len(geometry.position), int) if geometry.region is None else geometry.region

@@ -10,7 +10,6 @@ References in comments are to the plugin reference of Mitsuba 3, https://mitsuba
 
 import math
 import pathlib
-import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,7 +22,7 @@ from jaxprt.scene import environment
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.formats import mesh_file
-from jaxprt.scene.formats.file_parts import split_parts
+from jaxprt.scene.formats.file_parts import split_parts, warn_of_ignored
 from jaxprt.scene.formats.geometry import Geometry, place
 from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.mesh import grid_face
@@ -283,8 +282,7 @@ def read(scene: Mapping[str, Any]) -> Scene:
             lights.append(_environment(name, item))
         elif not MaterialMaker.knows(kind) and kind not in _SILENT:
             ignored.add(f"{name} ({kind})")
-    if ignored:
-        warnings.warn(f"the dictionary: not supported and ignored are {', '.join(sorted(ignored))}", stacklevel=3)
+    warn_of_ignored("the dictionary", ignored, stacklevel=3)
     return Scene(parts, cameras, lights)
 
 

@@ -7,16 +7,17 @@ import math
 import pathlib
 import re
 import warnings
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Set
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxprt.files import inputs
 from jaxprt.scene.formats import geometry, text
-from jaxprt.scene.formats.file_parts import TextureImages
-from jaxprt.scene.formats.geometry import Geometry, split_corners
+from jaxprt.scene.formats.file_parts import TextureImages, warn_of_ignored
+from jaxprt.scene.formats.geometry import Geometry, MeshContent, split_corners
 from jaxprt.scene.material import Texture, TexturedMaterial
+from jaxprt.scene.mesh import CLEAR
 
 KIND = "an undamaged OBJ file"
 _COMMENT = re.compile(r"^#.*|\s#(\s.*)?$")  # names may contain a #, such as Blender's "Material_#25"
@@ -27,22 +28,39 @@ _WHOLE = re.compile(rb"[+-]?\d{1,40}")  # of words with more digits, Python woul
 _CONTINUED = b" \v"  # replaces the line end after a backslash; \v is white space, and counts such lines for messages
 _BLOCK = 1 << 16  # lines whose words are in memory at once
 _LEAST = {b"v": 3, b"vt": 1, b"vn": 3}  # fewest numbers of a statement
-_MOST = 7  # numbers of a statement that are read
+_MOST = 8  # numbers of a statement that are looked at
+# Statements without effect on triangles, besides those that are read. Smoothing groups only matter without normals.
+_HARMLESS = {b"o", b"g", b"usemtl", b"mtllib", b"s", b"lod", b"bevel", b"c_interp", b"d_interp", b""}
+_LISTED = 8  # unknown statements that a warning names
 _NONE = -1 << 62  # index that a corner does not have
 _WRONG = -1 << 61  # index that is no number or refers to nothing
 _COLORS = {"Kd": "base_color", "Ke": "emissive", "Ks": "Ks"}
-_NUMBERS = {"Ns", "Ni", "Pr", "Pm", "illum"}
+_NUMBERS = {"Ns", "Ni", "Pr", "Pm", "Pc", "Pcr", "Ps", "aniso", "illum"}
+_UP_TO_1 = {"Kd", "Ks", "Pr", "Pm", "Pc", "Pcr", "Ps"}
 # Target of each map: field, channels, and whether it holds sRGB colors.
 _MAPS = {
     "map_Kd": ("base_color_texture", (0, 1, 2), True),
     "map_Ke": ("emissive_texture", (0, 1, 2), True),
     "map_Pr": ("roughness_texture", (0,), False),
     "map_Pm": ("metallic_texture", (0,), False),
+    "map_Ps": ("sheen_color_texture", (0, 1, 2), False),
+    "map_d": ("alpha_texture", (3,), False),
     "norm": ("normal_texture", (0, 1, 2), False),
 }
+_BUMPS = {"map_Bump", "map_bump", "bump"}  # heights, or normals as norm has them
+_MAP_OF = {"Kd": "map_Kd", "Ke": "map_Ke", "Pr": "map_Pr", "Pm": "map_Pm", "Ps": "map_Ps"}  # what multiplies a factor
 _ARGUMENTS = {"-mm": 2, "-o": 3, "-s": 3, "-t": 3}  # most values of map options; all other options have one
-_SILENT = {"Ka", "map_Ka", "Tf", "sharpness"}  # ambient light is computed; the others concern refraction
-_OPACITY = {"d", "Tr", "map_d"}
+_NEUTRAL = {"-blendu": ["on"], "-blendv": ["on"], "-cc": ["off"], "-mm": [0, 1], "-t": [0, 0, 0]}  # no effect
+_SCALARS = {"r": (0,), "g": (1,), "b": (2,), "m": (3,)}  # channels of -imfchan for maps of one channel
+# Ambient light is computed, sharpness is that of reflection maps, and anisor turns what aniso states.
+_SILENT = {"Ka", "map_Ka", "sharpness", "anisor", "map_aat"}
+_REFLECTING = {0, 1, 2, 3, 5, 8}  # illum of opaque surfaces
+_REFRACTING = {4, 6, 7, 9}
+_SHEEN = 0.5  # roughness of sheens, for which MTL has no statement: Blender's default
+_UNIT, _NORMALS = 0.1, 0.9  # deviation of normals from unit length, and the least share of pixels that have them
+_BLUISH = 0.1  # by which the mean height of normals exceeds their slopes
+_SAMPLED = 1 << 18  # pixels of which normal maps are recognized
+_OPACITY = {"d", "Tr"}
 _BLENDER = re.compile(
     r"# Blender (v?)(\d+)\.(\d+)"
 )  # first line of OBJ files by Blender; the v is from its older exporter
@@ -123,7 +141,7 @@ def used_materials(source: bytes) -> tuple[list[str | None], list[str]]:
     return list(order), files
 
 
-def read(path: pathlib.Path, *, groups: bool) -> Geometry:
+def read(path: pathlib.Path, *, groups: bool) -> MeshContent:
     """Reads the geometry of an OBJ file. Colors are NaN where vertices have none.
 
     Args:
@@ -134,17 +152,24 @@ def read(path: pathlib.Path, *, groups: bool) -> Geometry:
         ValueError: A statement is damaged. The message names the file and the line.
     """
     source = _Source(path, content(path))
-    rows, faces = _statements(source, groups=groups)
+    rows, faces, ignored = _statements(source, groups=groups)
     if not len(faces.size):
-        raise ValueError(f"{path} must hold vertices and faces, got no faces")
-    return _geometry(rows, _absolute_indices(faces, rows, source), source)
+        extra = f" ({', '.join(sorted(ignored))} are not read)" if ignored else ""
+        raise ValueError(f"{path} must hold vertices and faces, got no faces{extra}")
+    geometry = _geometry(rows, _absolute_indices(faces, rows, source), source)
+    return MeshContent(geometry, [], ignored | _extra_numbers(rows[0].value))
 
 
-def _statements(source: _Source, *, groups: bool) -> tuple[list[_Rows], _Faces]:
-    """Reads all statements in blocks of lines, so that not all words are in memory at once."""
+def _statements(source: _Source, *, groups: bool) -> tuple[list[_Rows], _Faces, set[str]]:
+    """Reads all statements in blocks of lines, so that not all words are in memory at once.
+
+    Returns:
+        The numbers of v, vt and vn; the faces; and the names of statements that are not read.
+    """
     rows: dict[bytes, list[_Rows]] = {kind: [] for kind in _LEAST}
     faces: list[_Faces] = []
     regions: dict[tuple[str, ...], int] = {}
+    unread: dict[bytes, None] = {}
     names = {b"o": "", b"g": ""} if groups else {b"usemtl": ""}
     region, start = -1, 0
     stream = io.BytesIO(source.content)
@@ -164,14 +189,19 @@ def _statements(source: _Source, *, groups: bool) -> tuple[list[_Rows], _Faces]:
                     region_of.append(region)
             elif kind in names:
                 names[kind], region = _name(tail), -1
+            elif kind not in _HARMLESS and not kind.startswith(b"#"):
+                unread[kind] = None
         for kind, parts in rows.items():
             if tails[kind]:
                 parts.append(_Rows(_numbers(tails[kind], kind, places[kind], source), np.array(places[kind])))
         if region_of:
             faces.append(_Faces(*_indices(tails[b"f"]), np.array(places[b"f"]), np.array(region_of)))
         start += len(lines)
+    ignored = {f"statements {inputs.shortened(text.name(kind))}" for kind in itertools.islice(unread, _LISTED)}
+    ignored |= {f"{len(unread) - _LISTED} statements more"} if len(unread) > _LISTED else set()
     empty = _Faces(np.zeros((0, 3), np.int64), *np.zeros((3, 0), np.int64))
-    return [_rows(parts) for parts in rows.values()], _Faces(*map(np.concatenate, zip(empty, *faces, strict=True)))
+    joined = _Faces(*map(np.concatenate, zip(empty, *faces, strict=True)))
+    return [_rows(parts) for parts in rows.values()], joined, ignored
 
 
 def _name(tail: bytes) -> str:
@@ -311,17 +341,30 @@ def _geometry(rows: list[_Rows], faces: _Faces, source: _Source) -> Geometry:
     return Geometry(position, corner[triangle.corner], normal, None, None, texture, None, color, region[first])
 
 
+def _extra_numbers(vertex: np.ndarray) -> set[str]:
+    """What the numbers after the positions and colors of vertices are: only rational curves and alpha use them."""
+    finite = np.isfinite(vertex)
+    count = vertex.shape[1] - finite[:, ::-1].argmax(1)
+    ignored: set[str] = set()
+    if (vertex[count == 4, 3:4] != 1).any():
+        ignored.add("the fourth number of vertices, a weight (polygons have none)")
+    if (count == 5).any() or not np.isin(vertex[count > 6, 6:], (1, 255)).all():
+        ignored.add("numbers of vertices beyond x y z w and x y z r g b")
+    return ignored
+
+
 def materials_of_regions(
-    path: pathlib.Path, plain: TexturedMaterial, *, outside: bool = False
+    path: pathlib.Path, plain: TexturedMaterial, unread: Set[str], *, outside: bool = False
 ) -> tuple[list[str], list[TexturedMaterial]]:
     """Names and materials of the regions of an OBJ file, in the order of their first faces.
 
-    A single warning names everything that is missing (MTL files, materials, images) or not supported. Missing materials
+    A single warning names everything that is missing (MTL files, materials, images) or not read. Missing materials
     are replaced by `plain`. Materials that no face has are not read. Textures of one image share it.
 
     Args:
         path: The OBJ file.
         plain: Material of faces without one.
+        unread: What of the geometry is not read, for the warning.
         outside: Whether MTL files and images may be outside of the folder of the OBJ file.
 
     Raises:
@@ -330,26 +373,28 @@ def materials_of_regions(
     source = content(path)
     order, files = used_materials(source)
     materials: dict[str, TexturedMaterial] = {}
-    ignored: set[str] = set()
+    ignored = set(unread)
+    earlier: dict[str, dict[str, list[str]]] = {}
     first = text.name(source.partition(b"\n")[0])
     pictures = TextureImages()
     read_already: set[pathlib.Path] = set()
     refer = functools.partial(inputs.reference, folder=path.parent, outside=outside)
     for file in files:
         named = refer(file, path.parent, owner=f"{path}, mtllib")
-        words = file.split() if _absence(named) else []
+        words = file.split() if inputs.absence(named) else []
         for library in [refer(word, path.parent, owner=f"{path}, mtllib") for word in words] or [named]:
-            absence = _absence(library)
+            absence = inputs.absence(library)
             if absence:
                 ignored.add(f"mtllib ({library}, {absence})")
             elif (target := library.resolve()) not in read_already:
                 read_already.add(target)
-                wanted = {label or "" for label in order} - materials.keys()
-                material, more = read_mtl(library, wanted, blender=_exponent(first), refer=refer, pictures=pictures)
+                wanted = {label or "" for label in order}
+                material, more = read_mtl(
+                    library, wanted, earlier, blender=_exponent(first), refer=refer, pictures=pictures
+                )
                 materials, ignored = material | materials, ignored | more
     ignored |= {f"usemtl {label} (no such material)" for label in order if label is not None and label not in materials}
-    if ignored:
-        warnings.warn(f"{path}: not supported and ignored are {', '.join(sorted(ignored))}", stacklevel=3)
+    warn_of_ignored(path, ignored, stacklevel=3)
     return [label or "default" for label in order], [materials.get(label or "", plain) for label in order]
 
 
@@ -366,7 +411,8 @@ def _exponent(line: str) -> float | None:
 
 def read_mtl(
     path: pathlib.Path,
-    wanted: Collection[str],
+    wanted: Set[str],
+    earlier: dict[str, dict[str, list[str]]],
     *,
     blender: float | None = None,
     refer: Callable[..., pathlib.Path],
@@ -380,15 +426,20 @@ def read_mtl(
     closest to the lobe of exponent Ns: alpha = sqrt(2 / (Ns + 2)), roughness = sqrt(alpha) (Walter et al. 2007,
     "Microfacet models for refraction through rough surfaces", section 5.2).
 
-    The opacity is d (or 1 - Tr) times map_d, a share of the light. It is read whatever illum says.
+    A factor of 0 beside its map would hide the map. Some programs write that, so the factor is then 1, with a warning.
+
+    The opacity is d (or 1 - Tr) times map_d, a share of the light. It is read whatever illum says. Nothing is
+    refracted. Pc and Pcr are a clear coat and its roughness; Ps is a white sheen. map_Bump is read where its image
+    holds normals, as norm does, and -bm scales their slopes. Heights are not read.
 
     Blender 2.80 and newer writes its principled material differently: Ns = `blender` (1 - roughness)^2, Ks = 12.5 times
-    the reflectance at normal incidence, and metalness as Ka if illum is 3 or 6. Its textures replace the factors, and
-    map_Bump is a normal map. Factors that accompany Pr and Pm are read in this way too.
+    the reflectance at normal incidence, and metalness as Ka if illum is 3 or 6. Its textures replace the factors.
+    Factors that accompany Pr and Pm are read in this way too.
 
     Args:
         path: The file.
         wanted: Names of the materials that are read, if the file has them.
+        earlier: Statements of materials in files before this one, which come first. Those of this file are added.
         blender: Exponent that Blender writes for a roughness of 0, if the first line of the OBJ file names Blender;
             None for files of other programs.
         refer: `inputs.reference` with the folder in which images must be.
@@ -402,6 +453,8 @@ def read_mtl(
     """
     ignored: set[str] = set()
     named: dict[str, dict[str, list[str]]] = {}
+    several: dict[str, dict[str, list[str]]] = {}
+    name = ""
     statements: dict[str, list[str]] = {}
     lines = [text.name(line) for line in text.read(path, "an MTL file").split(b"\n")]
     if not lines or not lines[0].startswith("# Blender"):
@@ -409,12 +462,24 @@ def read_mtl(
     for line in lines:
         key, *rest = statement(line).split() or [""]
         if key == "newmtl":
-            named[" ".join(rest)] = statements = {}
+            name = " ".join(rest)
+            previous = named.get(name)
+            named[name] = statements = {}
+            several |= {name: previous} if previous else {}
         elif key:
-            statements[key] = rest if key in _MAPS or key == "map_d" else " ".join(rest).partition("#")[0].split()
-    material = {
-        name: _material(named[name], path, name, ignored, blender, refer, pictures) for name in named if name in wanted
-    }
+            words = rest if key in _MAPS or key in _BUMPS else " ".join(rest).partition("#")[0].split()
+            if statements.get(key, words) != words and name in wanted:
+                ignored.add(f"all but the last {key} of material {name!r}")
+            statements[key] = words
+            if not named:
+                ignored.add(f"{key} before the first newmtl")
+    ignored |= {f"all but the last newmtl {name}" for name in wanted & several.keys() if several[name] != named[name]}
+    material = {}
+    for name in [name for name in named if name in wanted]:
+        if earlier.setdefault(name, named[name]) is named[name]:
+            material[name] = _material(named[name], path, name, ignored, blender, refer, pictures)
+        elif earlier[name] != named[name]:
+            ignored.add(f"newmtl {name} of {path} (a file before it has another)")
     return material, ignored
 
 
@@ -428,24 +493,33 @@ def _material(
     pictures: TextureImages,
 ) -> TexturedMaterial:
     """The material from the statements after one newmtl."""
-    if blender is not None:
-        statements = {"norm" if key == "map_Bump" else key: words for key, words in statements.items()}
     keys = [*_COLORS, *_NUMBERS, *([] if blender is None else ["Ka"])]
     value = {key: _number(statements, key, path, name) for key in keys if key in statements}
-    for key in value.keys() & {"Kd", "Ks", "Pr", "Pm"}:
+    ignored |= {f"{key} below {least}" for key, least in (("Ni", 1), ("Ns", 0)) if value.get(key, least) < least}
+    for key in value.keys() & _UP_TO_1:
         if np.max(value[key]) > 1:
             ignored.add(f"{key} above 1")
             value[key] = np.minimum(value[key], 1)
-    field: dict[str, Any] = {_COLORS[key]: value[key] for key in ("Kd", "Ke") if key in value}
+    field: dict[str, Any] = {}
     for key, words in statements.items():
-        if key in _MAPS or key == "map_d":
+        if key in _BUMPS and "norm" in statements:
+            ignored.add(f"{key} beside norm")
+        elif key in _MAPS or key in _BUMPS:
             options, words = _options(words)
-            owner = f"{path}, {key} of material {name!r}"
+            owner = f"{path}, {key} of material {inputs.shortened(name)!r}"
             file = refer(" ".join(words), path.parent, owner=owner)
             _add_map(field, key, options, file, owner, ignored, pictures)
-        elif key not in value and key not in _SILENT | _OPACITY:
+        elif key not in value and key not in _SILENT | _OPACITY | {"Tf"}:
             ignored.add(key)
-    field |= _opacity(statements, "alpha_texture" in field, path, name, ignored)
+    for key, image in _MAP_OF.items():
+        if (_MAPS[image][0] in field or image == "map_Kd") and image in statements and not np.any(value.get(key, 0)):
+            if key in value and blender is None:
+                ignored.add(f"{key} of 0 beside {image} (it counts as 1)")
+            value[key] = 1.0
+    field |= {_COLORS[key]: value[key] for key in ("Kd", "Ke") if key in value}
+    field |= _opacity(statements, path, name, ignored, field.get("alpha_texture"))
+    field |= _layers(value, ignored)
+    ignored |= _unread_light(statements, value, blender is not None and "alpha_mode" in field)
     if blender is not None:
         field |= _principled(value, field.keys(), blender)
         return _make_material(field, path, name)
@@ -463,7 +537,7 @@ def _material(
 
 
 def _opacity(
-    statements: dict[str, list[str]], textured: bool, path: pathlib.Path, name: str, ignored: set[str]
+    statements: dict[str, list[str]], path: pathlib.Path, name: str, ignored: set[str], image: Texture | None
 ) -> dict[str, Any]:
     """The opacity of a material: d, or 1 - Tr without d. An opaque material without map_d has none."""
     alpha = 1.0
@@ -473,9 +547,48 @@ def _opacity(
         if not 0 <= number <= 1:
             ignored.add(f"{key} below 0 or above 1")
         alpha = min(max(number if key == "d" else 1 - number, 0.0), 1.0)
-    if alpha == 1 and not textured:
+        if statements[key][0] == "-halo" and alpha < 1:
+            ignored.add(f"-halo of {key}")
+    if alpha == 0 and "map_d" in statements:
+        ignored.add(f"{key} {' '.join(statements[key])} beside map_d (it counts as opaque)")
+        alpha = 1.0
+    if alpha == 1 and image is None:
         return {}
+    if alpha * (1 if image is None else float(np.max(image.image))) < CLEAR:
+        ignored.add(f"faces of material {name!r} (they are invisible: its opacity is 0)")
     return {"alpha": alpha, "alpha_mode": "blend"}
+
+
+def _layers(value: dict[str, Any], ignored: set[str]) -> dict[str, Any]:
+    """The clear coat and the sheen of a material."""
+    if value.get("aniso"):
+        ignored.add("aniso")
+    field = {"clearcoat": value.get("Pc", 0.0), "clearcoat_roughness": value.get("Pcr", 0.0)}
+    if not value.get("Ps"):
+        return field
+    if field["clearcoat"]:
+        ignored.add("Ps beside Pc (sheens under clear coats)")
+        return field
+    return field | {"sheen_color": value["Ps"], "sheen_roughness": _SHEEN}
+
+
+def _unread_light(statements: dict[str, list[str]], value: dict[str, Any], transparent: bool) -> set[str]:
+    """What passes through a surface and is not read: refraction, and its color.
+
+    Args:
+        statements: The statements of a material.
+        value: Their numbers.
+        transparent: Whether illum 4 to 9 only say that the surface is transparent, as Blender writes them.
+    """
+    model, ignored = value.get("illum", 2), set()
+    if model in _REFRACTING and not transparent:
+        ignored.add(f"illum {model:g} (glass: nothing is refracted, and only d, Tr and map_d let light through)")
+    elif model not in _REFLECTING | _REFRACTING:
+        ignored.add(f"illum {model:g}")
+    words = statements.get("Tf", ["1"])
+    if not all(_is_number(word) and float(word) == 1 for word in words):
+        ignored.add(f"Tf {' '.join(words)} (the color of light that passes through)")
+    return ignored
 
 
 def _principled(value: dict[str, Any], stated: Collection[str], exponent: float) -> dict[str, Any]:
@@ -503,7 +616,7 @@ def _make_material(field: dict[str, Any], path: pathlib.Path, name: str) -> Text
         with np.errstate(over="ignore"):  # materials refuse what is not finite
             return TexturedMaterial(**field)
     except ValueError as error:
-        raise ValueError(f"{path}, material {name!r}: {error}") from error
+        raise ValueError(f"{path}, material {inputs.shortened(name)!r}: {error}") from error
 
 
 def _number(statements: dict[str, list[str]], key: str, path: pathlib.Path, name: str) -> Any:
@@ -515,11 +628,12 @@ def _number(statements: dict[str, list[str]], key: str, path: pathlib.Path, name
         if not words or words[0] in ("spectral", "xyz"):
             raise ValueError
         number = [float(word) for word in words[: 3 if key in _COLORS else 1]]
-        if not all(math.isfinite(value) for value in number):
+        if not all(math.isfinite(value) for value in number) or len(number) == 2:
             raise ValueError
     except ValueError:
-        got = " ".join([key, *words])
-        raise ValueError(f"{path}, material {name!r}: {key} must have finite numbers, got {got!r}") from None
+        got, where = inputs.shortened(" ".join([key, *words])), f"{path}, material {inputs.shortened(name)!r}"
+        form = " (1 or 3 of linear RGB; spectral curves and CIE XYZ must be converted)" if key in _COLORS else ""
+        raise ValueError(f"{where}: {key} must have finite numbers, got {got!r}{form}") from None
     if key not in _COLORS:
         return number[0]
     return np.array(number if len(number) == 3 else number[:1] * 3)
@@ -538,25 +652,30 @@ def _add_map(
 
     The opacity of map_d is the alpha of an image that has one, and otherwise its first channel.
     """
-    name, channels, decoded = _MAPS.get(key, ("alpha_texture", (3,), False))
+    name, channels, decoded = _MAPS.get(key, _MAPS["norm"])
+    chosen = _SCALARS.get(" ".join(options.get("-imfchan", []))) if len(channels) == 1 else None
     try:
-        absence = _absence(file)
+        absence = inputs.absence(file)
         if absence:
             raise ValueError(f"{file}, {absence}")
-        image = pictures.read(file, channels, decoded=decoded)
-        if key == "map_d" and np.min(image) == 1:
+        image = pictures.read(file, chosen or channels, decoded=decoded)
+        if key == "map_d" and chosen is None and np.min(image) == 1:
             image = pictures.read(file, (0,), decoded=False)
+        if key in _BUMPS and not _holds_normals(np.asarray(image)):
+            raise ValueError(f"{file} holds no normals: heights are not read")
     except ValueError as error:
         ignored.add(f"{key} ({error})")
         return
-    honored = {"-o", "-s", "-clamp"}
+    honored = {"-o", "-s"} | ({"-imfchan"} if chosen else set())
+    honored |= {option for option, words in options.items() if _is_neutral(option, words)}
     strength = options.get("-bm", [])
     if name == "normal_texture" and len(strength) == 1 and _is_number(strength[0]):
         honored |= {"-bm"}
         field["normal_scale"] = float(strength[0])
+    wrap = "clamp" if options.get("-clamp") == ["on"] else "repeat"
+    honored |= {"-clamp"} if options.get("-clamp") in (["on"], ["off"]) else set()
     ignored |= {f"option {option} of maps" for option in options.keys() - honored}
     scale, offset = (_pair(options.get(option, []), plain) for option, plain in (("-s", 1.0), ("-o", 0.0)))
-    wrap = "clamp" if options.get("-clamp") == ["on"] else "repeat"
     with np.errstate(over="ignore"):  # textures refuse what is not finite
         transform = np.array([[scale[0], 0, offset[0]], [0, scale[1], offset[1]]]).astype(np.float32)
     try:
@@ -565,15 +684,22 @@ def _add_map(
         raise ValueError(f"{owner}: {error}") from error
 
 
-def _absence(path: pathlib.Path) -> str:
-    """Why a path is not that of a regular file; empty if it is."""
-    try:
-        inputs.check(path, "a file")
-    except FileNotFoundError:
-        return "which does not exist"
-    except ValueError:
-        return "which is not a regular file"
-    return ""
+def _holds_normals(image: np.ndarray) -> bool:
+    """Whether an image [h w 3] is a normal map: mostly bluish, with vectors of unit length that point outward."""
+    step = math.ceil(math.sqrt(image.shape[0] * image.shape[1] / _SAMPLED))
+    vector = 2 * image[::step, ::step].reshape(-1, 3).astype(np.float64) - 1
+    red, green, blue = vector.mean(0)
+    normal = (np.abs(np.linalg.norm(vector, axis=1) - 1) < _UNIT) & (vector[:, 2] > 0)
+    return bool(blue > max(red, green) + _BLUISH and normal.mean() > _NORMALS)
+
+
+def _is_neutral(option: str, words: list[str]) -> bool:
+    """Whether an option of a map has no effect."""
+    if option == "-texres":  # the resolution that an image is scaled to
+        return True
+    neutral = _NEUTRAL.get(option, [])
+    value = [float(word) if _is_number(word) else word for word in words]
+    return option in _NEUTRAL and value == neutral[: len(value)]
 
 
 def _options(words: list[str]) -> tuple[dict[str, list[str]], list[str]]:

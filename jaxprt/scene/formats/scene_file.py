@@ -1,7 +1,6 @@
 """Loading of meshes and scenes from files of all supported formats."""
 
 import pathlib
-import warnings
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
@@ -43,8 +42,8 @@ def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The file is of an unknown kind, damaged or empty, has positions that are not finite, or faces that
-            refer to missing vertices. An OBJ file truncated between two faces cannot be detected.
+        ValueError: The file is of an unknown kind, damaged or empty, has positions that are not finite, faces that
+            refer to missing vertices, or only faces without area. An OBJ file truncated between two faces cannot be detected.
     """
     path = pathlib.Path(path)
     return from_file(mesh_file.read(path, groups=groups), path)
@@ -98,9 +97,10 @@ def load_scene(
     cannot be read, and so on). Primitives without material get the default material of the specification, a white rough
     metal.
 
-    From an OBJ file, this reads the materials of its MTL files: Kd, Ks, Ns, Ke, map_Kd, map_Ke, norm, and the
-    metallic-roughness statements Pr, Pm, map_Pr, map_Pm and Ni. `obj.read_mtl` explains how Phong materials and those
-    of Blender are converted. A single warning names missing MTL files, materials and images and unsupported statements.
+    From an OBJ file, this reads the materials of its MTL files: Kd, Ks, Ns, Ke, d, Tr, map_Kd, map_Ke, map_d, norm,
+    bumps that are normal maps, the metallic-roughness statements Pr, Pm, map_Pr, map_Pm and Ni, and Pc, Pcr and Ps.
+    `obj.read_mtl` explains how Phong materials and those of Blender are converted. A single warning names missing MTL
+    files, materials and images, and what is not read.
 
     Files of other formats, and OBJ files without materials, become one matte gray part that is named after the file.
     Colors of vertices or faces (PLY, OBJ, OFF) replace the gray, and multiply the base color of materials. They are
@@ -115,7 +115,8 @@ def load_scene(
 
     A scene file from a stranger must not read other files of the user. What it refers to (buffers, images, MTL files)
     must therefore be regular files in its folder or in folders below, after links are resolved. File names in a
-    dictionary are not restricted, because the caller writes the dictionary.
+    dictionary are not restricted, because the caller writes the dictionary. If no file has a name, one whose name
+    differs from it only in the case of letters or in its Unicode form is read.
 
     Args:
         path: The file, or the dictionary.
@@ -132,10 +133,10 @@ def load_scene(
         The scene.
 
     Raises:
-        FileNotFoundError: The file, or a buffer or an image of a glTF file, does not exist.
+        FileNotFoundError: The file, or a buffer of a glTF file, does not exist. Images that do not are warned of.
         ImportError: The file is compressed, and a package of `jaxprt[web]` is missing.
-        ValueError: The file is of an unknown kind, damaged, or has no triangles; it refers to a file outside of its
-            folder, or requires an unknown extension; a factor is not finite or out of range; or a BSDF of a dictionary
+        ValueError: The file is of an unknown kind, damaged, or has no triangles with an area; it refers to a file
+            outside of its folder, or requires an unknown extension; a factor is not finite or out of range; or a BSDF of a dictionary
             is not supported.
         MemoryError: The scene does not fit into memory.
     """
@@ -156,12 +157,11 @@ def load_scene(
     content = mesh_file.content(path, groups=False)
     plain = file_parts.matte(geometry=content.geometry)
     if path.suffix.lower() == ".obj":
-        names, materials = obj.materials_of_regions(path, plain, outside=outside)
+        names, materials = obj.materials_of_regions(path, plain, content.ignored, outside=outside)
         if names == ["default"]:
             names = [path.stem]
     else:
         materials, ignored = file_parts.materials_of_images(content, plain, path, outside=outside)
         names = [path.stem] * len(materials)
-        if ignored:
-            warnings.warn(f"{path}: not supported and ignored are {', '.join(sorted(ignored))}", stacklevel=2)
+        file_parts.warn_of_ignored(path, ignored, stacklevel=2)
     return Scene(split_parts(file_parts.with_base_color(content.geometry, materials, plain), names, materials, path))

@@ -28,6 +28,10 @@ FACE = "f 1/1 2/2 3/3 4/4\n"
 IMAGE = np.array([[[1, 0, 0], [0, 1, 0]], [[0, 0, 1], [1, 1, 1]]], np.float32)  # Red, green; blue, white.
 
 
+slope = np.random.default_rng(0).uniform(-0.5, 0.5, (4, 4, 2))
+NORMALS = np.float32(0.5 + 0.5 * np.concatenate([slope, np.sqrt(1 - (slope**2).sum(-1, keepdims=True))], -1))
+
+
 def write(folder, text, name="scene.obj"):
     path = folder / name
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
@@ -183,7 +187,8 @@ def test_many_faces_are_as_many_triangles(tmp_path):
 
 def test_an_empty_material_name_is_that_of_faces_without_a_material(tmp_path):
     text = TRIANGLE + "usemtl \nf 3 2 1\nusemtl.map_off a\nusemtl\nf 1 2 3\n"
-    (part,) = load_scene(write(tmp_path, text)).parts
+    with pytest.warns(UserWarning, match=r"ignored are statements usemtl\.map_off$"):
+        (part,) = load_scene(write(tmp_path, text)).parts
     assert part.name == "scene"
     assert len(part.mesh.face) == 3
 
@@ -271,7 +276,8 @@ def test_materials_that_blender_exports_come_back(tmp_path, header, exponent, ro
 
 def test_textures_that_blender_exports_replace_the_factors_and_its_bumps_are_normal_maps(tmp_path):
     write_png(tmp_path / "c.png", IMAGE)
-    maps = "map_Kd c.png\nmap_Pr c.png\nmap_Ke c.png\nmap_Bump -bm 0.5 c.png\n"
+    write_png(tmp_path / "n.png", NORMALS)
+    maps = "map_Kd c.png\nmap_Pr c.png\nmap_Ke c.png\nmap_Bump -bm 0.5 n.png\n"
     statements = f"Kd .8 .8 .8\nKs .5 .5 .5\nKe 0 0 0\nNs 250\nPr .5\nPm .25\nillum 2\n{maps}"
     material = exported(tmp_path, "# Blender 4.2.1 LTS", statements)
     np.testing.assert_array_equal(material.base_color, [1] * 3)
@@ -336,7 +342,7 @@ def test_damaged_images_are_decoded_once_and_named_once(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("statement", "alpha"),
-    [("d -halo 0.5", 0.5), ("d -halo 1.0", None), ("d 1 # -halo", None), ("Tr .25", 0.75), ("d .5\nTr .25", 0.5)],
+    [("d 0.5", 0.5), ("d -halo 1.0", None), ("d 1 # -halo", None), ("Tr .25", 0.75), ("d .5\nTr .25", 0.5)],
 )
 def test_d_and_tr_are_opacities(tmp_path, statement, alpha):
     material = one(tmp_path, f"{statement}\n").material
@@ -353,6 +359,116 @@ def test_map_d_is_the_alpha_of_an_image_or_else_its_gray(tmp_path):
         np.testing.assert_allclose(material.alpha_texture.image, [[[0.2]]], rtol=1e-6)
     with pytest.warns(UserWarning, match="ignored are d below 0 or above 1"):
         assert float(one(tmp_path, "d -1\n").material.alpha) == 0
+
+
+REFRACTED = r"illum {} \(glass: nothing is refracted, and only d, Tr and map_d let light through\)"
+
+
+@pytest.mark.parametrize(
+    ("statements", "words"),
+    [
+        *((f"Kd 0 0 0\nTf 1 1 1\nNi 1.5\nillum {model}", REFRACTED.format(model)) for model in (4, 6, 7, 9)),
+        ("d .5\nillum 9", REFRACTED.format(9)),
+        ("illum 10", "illum 10"),
+        ("d .5\nTf 1 0 0", r"Tf 1 0 0 \(the color of light that passes through\)"),
+        ("d 0", r"faces of material 'a' \(they are invisible: its opacity is 0\)"),
+        ("Tr 1", r"faces of material 'a' \(they are invisible: its opacity is 0\)"),
+        ("map_d black.png", r"faces of material 'a' \(they are invisible: its opacity is 0\)"),
+        ("d -halo .5", "-halo of d"),
+        ("Kd 1 0 0\nKd 0 1 0", "all but the last Kd of material 'a'"),
+        ("Kd 1 0 0\nnewmtl a\nKd 0 1 0", "all but the last newmtl a"),
+        ("aniso .5\nanisor .2", "aniso"),
+        ("Ps .4\nPc 1", r"Ps beside Pc \(sheens under clear coats\)"),
+        ("Pr .5\nNi .5", "Ni below 1"),
+        ("map_Ks black.png\ndisp black.png\nrefl -type sphere black.png", "disp, map_Ks, refl"),
+        ("norm normal.png\nbump black.png", "bump beside norm"),
+        ("map_Pr -mm .1 .9 -blendu off -clamp yes -imfchan z black.png", "option -blendu of maps, .*-mm of maps"),
+    ],
+)
+def test_what_changes_the_picture_and_is_not_read_is_named(tmp_path, statements, words):
+    write_png(tmp_path / "black.png", np.zeros((2, 2, 3), np.float32))
+    write_png(tmp_path / "normal.png", NORMALS)
+    with pytest.warns(UserWarning, match=rf"not supported and ignored are {words}$"):
+        one(tmp_path, statements)
+
+
+def test_statements_without_effect_are_not_named(tmp_path):
+    write_png(tmp_path / "n.png", NORMALS)
+    neutral = "-blendu on -blendv on -cc off -mm 0 1 -t 0 0 0 -clamp off -texres 512"
+    statements = "Tf 1 1 1\nillum 5\naniso 0\nanisor .2\nPc 0\nPs 0\nKd 1 0 0\nKd 1 0 0\n"
+    statements += f"map_Pm {neutral} -imfchan g n.png\n"
+    material = one(tmp_path, f"{statements}newmtl a\n{statements}").material
+    np.testing.assert_allclose(material.metallic_texture.image, NORMALS[..., 1:2], atol=1 / 255)
+    assert (float(material.clearcoat), float(np.max(material.sheen_color))) == (0, 0)
+
+
+def test_coats_and_sheens_are_read(tmp_path):
+    material = one(tmp_path, "Pr .5\nPc .75\nPcr .25\n").material
+    assert (float(material.clearcoat), float(material.clearcoat_roughness)) == (0.75, 0.25)
+    material = one(tmp_path, "Ps .25\n").material
+    np.testing.assert_array_equal(material.sheen_color, [0.25] * 3)
+    assert float(material.sheen_roughness) == 0.5
+
+
+@pytest.mark.parametrize("key", ["map_Bump", "map_bump", "bump", "norm"])
+def test_bumps_are_normal_maps_where_their_images_hold_normals(tmp_path, key):
+    write_png(tmp_path / "n.png", NORMALS)
+    material = one(tmp_path, f"{key} -bm 0.7 n.png\n").material
+    np.testing.assert_allclose(material.normal_texture.image, NORMALS, atol=1 / 255)
+    assert float(material.normal_scale) == pytest.approx(0.7)
+    # Heights, of which 0.789 has the unit length of a normal; a blue color; and normals that point inward.
+    random = np.random.default_rng(0).random((4, 4, 1))
+    wrong = [np.repeat(random, 3, 2), np.full((4, 4, 3), 0.789), np.full((4, 4, 3), [0.4, 0.5, 0.8]), 1 - NORMALS]
+    for image in wrong if key != "norm" else []:
+        write_png(tmp_path / "h.png", np.float32(image))
+        with pytest.warns(UserWarning, match=rf"{key} \(.*h\.png holds no normals: heights are not read\)$"):
+            assert one(tmp_path, f"{key} h.png\n").material.normal_texture is None
+
+
+@pytest.mark.parametrize(("key", "name"), [("Kd", "base_color"), ("Ke", "emissive"), ("Pr", "roughness"), ("Ps", "")])
+def test_factors_of_zero_beside_their_maps_count_as_one(tmp_path, key, name):
+    write_png(tmp_path / "c.png", IMAGE)
+    with pytest.warns(UserWarning, match=rf"ignored are {key} of 0 beside map_{key} \(it counts as 1\)$"):
+        material = one(tmp_path, f"{key} 0\nmap_{key} c.png\n").material
+    np.testing.assert_array_equal(getattr(material, name or "sheen_color"), 1)
+    np.testing.assert_array_equal(getattr(one(tmp_path, f"map_{key} c.png\n").material, name or "sheen_color"), 1)
+
+
+def test_materials_of_several_files_are_those_of_the_first(tmp_path):
+    path = write_materials(tmp_path, "newmtl a\nKd 1 0 0\n")
+    path.write_text("mtllib scene.mtl other.mtl\n" + path.read_text().partition("\n")[2])
+    write(tmp_path, "newmtl a\nKd 1 0 0\nnewmtl b\nKd 0 1 1\n", "other.mtl")
+    load_scene(path)  # without a warning: they are the same
+    write(tmp_path, "newmtl a\nKd 0 1 0\n", "other.mtl")
+    with pytest.warns(UserWarning, match=r"newmtl a of .*other\.mtl \(a file before it has another\)$"):
+        np.testing.assert_array_equal(load_scene(path).parts[0].material.base_color, [1, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            "v 0 0 0 1\nv 0 0 1 .5\nv 1 0 0 1\nf 1 2 3",
+            r"the fourth number of vertices, a weight \(polygons have none\)",
+        ),
+        ("v 0 0 0 1 0 0 .5\nv 0 0 1 1 0 0\nv 1 0 0\nf 1 2 3", "numbers of vertices beyond x y z w and x y z r g b"),
+        (TRIANGLE + "l 1 2\np 1\nusemap x\ns off\nlod 1\n", "statements l, statements p, statements usemap"),
+        (TRIANGLE + "".join(f"x{number}\n" for number in range(11)), "3 statements more, statements x0, .*"),
+    ],
+)
+def test_what_is_not_read_of_the_geometry_is_named(tmp_path, text, words):
+    with pytest.warns(UserWarning, match=f"not supported and ignored are {words}$"):
+        (part,) = load_scene(write(tmp_path, text)).parts
+    np.testing.assert_array_equal(part.mesh.position, POSITION)
+
+
+@pytest.mark.parametrize(
+    "text", ["v 0 0 0\nv 1 0 0\nv 2 0 0\n", "v 3 3 3\n" * 3, "v .1 .2 .3\nv .2 .4 .6\nv .3 .6 .9\n"]
+)
+def test_files_of_faces_without_area_are_refused(tmp_path, text):
+    with pytest.raises(ValueError, match=r"scene\.obj must hold faces with an area, got 2 faces without"):
+        load_mesh(write(tmp_path, text + "f 1 2 3\nf 1 1 2\n"))
+    assert len(load_mesh(write(tmp_path, text + "v 1 0 9\nv 5 5 5\nf 1 1 2\nf 1 4 5\n")).face) == 2
 
 
 def test_maps_that_move_without_end_are_refused_by_name(tmp_path):
@@ -403,7 +519,13 @@ def test_what_is_missing_or_not_honored_is_said_once_by_name(tmp_path):
         ("Kd 1 x 1", "material 'a': Kd must have finite numbers, got 'Kd 1 x 1'"),
         ("Ns nan", "material 'a': Ns must have finite numbers, got 'Ns nan'"),
         ("Kd", "material 'a': Kd must have finite numbers, got 'Kd'"),
-        ("Kd spectral a.rfl", "material 'a': Kd must have finite numbers, got 'Kd spectral a.rfl'"),
+        *(
+            (
+                f"Kd {words}",
+                rf"material 'a': Kd must have finite numbers, got 'Kd {words}' \(1 or 3 of linear RGB; spec",
+            )
+            for words in ("spectral a.rfl", "xyz 1 1 1", ".5 .5")
+        ),
         ("Pr -1", "material 'a': roughness of TexturedMaterial must be between 0 and 1"),
     ],
 )
