@@ -21,7 +21,7 @@ from jaxprt.files import images
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Sun
 from jaxprt.scene.formats import gltf_geometry, gltf_nodes
-from jaxprt.scene.formats.file_parts import split_parts, store_channels
+from jaxprt.scene.formats.file_parts import split_parts, store_channels, warn_of_ignored
 from jaxprt.scene.formats.gltf_file import (
     HONORED,
     Document,
@@ -65,6 +65,7 @@ def read(
         names = [_name(document, index) for index in contents.material]
         parts = split_parts(contents.geometry, names, materials, path)
         ignored |= contents.ignored | reader.ignored | unread_extensions(document)
+        ignored |= {name for node in nodes for name in document.object(node.item, "extensions", f"node {node.number}")}
         for index, material in zip(contents.material, materials, strict=True):
             if any((index, texture.set) in contents.lacking for texture in material.textures):
                 ignored |= {"textures of primitives without texture coordinates"}
@@ -72,8 +73,7 @@ def read(
         cameras, skipped = _cameras(document, nodes, (used.min(0) + used.max(0)) / 2)
         point_lights, suns, unread_lights = read_lights(document, nodes, [part.name for part in parts], lights)
     ignored = (ignored | skipped | unread_lights) - HONORED
-    if ignored:
-        warnings.warn(f"{path}: not supported and ignored are {', '.join(sorted(ignored))}", stacklevel=3)
+    warn_of_ignored(path, ignored, stacklevel=3)
     if suns:
         advice = "jaxprt.scene.with_suns(light, scene.suns) adds them to an environment"
         warnings.warn(f"{path}: its directional lights ({len(suns)}) are in scene.suns: {advice}", stacklevel=3)
@@ -141,7 +141,6 @@ class MaterialReader:
 
         Raises:
             ValueError: A number is not finite or out of range, or an image is outside of the folder of the file.
-            FileNotFoundError: The file of an image does not exist.
             MemoryError: An image does not fit into memory.
         """
         if index is None:
@@ -258,7 +257,9 @@ class MaterialReader:
         info, owner = document.object(item, key, owner), f"{key} of {owner}"
         index = document.index("textures", info.get("index"), owner)
         texture, name = document.items("textures")[index], f"texture {index}"
-        moved = document.object(document.object(info, "extensions", owner), "KHR_texture_transform", owner)
+        extensions = document.object(info, "extensions", owner)
+        moved = document.object(extensions, "KHR_texture_transform", owner)
+        self.ignored |= extensions.keys()
         number = document.integer({**info, **moved}, "texCoord", owner, 0)
         source = self._source(texture, name)
         if source is None or number > 1:
@@ -267,9 +268,11 @@ class MaterialReader:
         sampler = {}
         if "sampler" in texture:
             sampler = document.item("samplers", texture["sampler"], name)
-        if sampler.get("magFilter") == _NEAREST:
+        if _NEAREST in (sampler.get("magFilter"), sampler.get("minFilter")):
             self.ignored.add("nearest filters (textures are interpolated)")
-        across, up = (_WRAP.get(document.integer(sampler, side, name, 0), "repeat") for side in ("wrapS", "wrapT"))
+        modes = [document.integer(sampler, side, name, 10497) for side in ("wrapS", "wrapT")]
+        self.ignored |= {f"wrap mode {mode}" for mode in modes if mode not in _WRAP}
+        across, up = (_WRAP.get(mode, "repeat") for mode in modes)
         image = self._pixels(source, channels, name, decoded)
         return None if image is None else Texture(image, self._transform(moved, owner), number, (across, up))
 
@@ -300,17 +303,23 @@ class MaterialReader:
         if key in self._damaged:
             return None
         self._decoded = None
-        content = self._document.image(index, owner)
         item = self._document.items("images")[index]
-        name = f"image {index}" if "bufferView" in item else f"image {index}, {item['uri'][:_SHOWN]}"
+        name = f"image {index}" if "bufferView" in item else f"image {index}, {str(item.get('uri'))[:_SHOWN]}"
+        try:
+            content = self._document.image(index, owner)
+        except FileNotFoundError as error:
+            return self._skip(key, error)
         try:
             image = images.decode_image(content, name=name, decoded=decoded)
         except ValueError as error:
-            self.ignored.add(f"textures that cannot be read ({error})")
-            self._damaged.add(key)
-            return None
+            return self._skip(key, error)
         self._decoded = key, image
         return image
+
+    def _skip(self, key: tuple[int, bool], reason: Exception) -> None:
+        """Records why an image cannot be read."""
+        self.ignored.add(f"textures that cannot be read ({reason})")
+        self._damaged.add(key)
 
     def _transform(self, moved: dict[str, Any], owner: str) -> np.ndarray:
         """The affine transform of KHR_texture_transform, for texture coordinates with v up.

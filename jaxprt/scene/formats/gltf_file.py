@@ -32,6 +32,7 @@ _WIDEST_ELEMENT = 256  # bytes of an element
 _MOST_DECODED = 1024
 DRACO = "KHR_draco_mesh_compression"
 INSTANCING = "EXT_mesh_gpu_instancing"
+QUANTIZATION = "KHR_mesh_quantization"
 # Compressed data are decoded where they have no uncompressed fallback.
 _COMPRESSION = {DRACO, *MESHOPT, "KHR_texture_basisu", "EXT_texture_webp"}
 HONORED = {
@@ -40,7 +41,7 @@ HONORED = {
         for name in ("ior", "specular", "anisotropy", "emissive_strength", "clearcoat", "sheen", "transmission")
     ),
     "KHR_texture_transform",
-    "KHR_mesh_quantization",
+    QUANTIZATION,
     INSTANCING,
     "KHR_lights_punctual",
     *_COMPRESSION,
@@ -293,12 +294,16 @@ def unread_extensions(header: Header) -> set[str]:
 
     Extensions of materials are left out: the reader of materials names those that a material of the scene has.
     """
-    names = (
+    return {name for name in stated_extensions(header) if not name.startswith(_LOOK)} - HONORED
+
+
+def stated_extensions(header: Header) -> set[str]:
+    """Names of the extensions that a file says it uses or requires."""
+    return {
         name
         for key in ("extensionsUsed", "extensionsRequired")
         for name in header.strings(header.header, key, "the file")
-    )
-    return {name for name in names if not name.startswith(_LOOK)} - HONORED
+    }
 
 
 def check_required(header: Header, *, geometry: bool) -> None:
@@ -317,7 +322,7 @@ def check_required(header: Header, *, geometry: bool) -> None:
         unknown = [name for name in unknown if not name.startswith(_NOT_GEOMETRY)]
     if unknown:
         known = ", ".join(sorted(HONORED))
-        raise header.error(f"must not require extensions other than {known}", ", ".join(unknown))
+        raise header.error(f"must not require extensions other than {known}", inputs.shortened(", ".join(unknown)))
 
 
 class Elements(NamedTuple):
@@ -445,12 +450,23 @@ class Document(Header):
         return Form(item, name, dtype, count, width, int(np.iinfo(dtype).max) if normalized else 0)
 
     def image(self, value: Any, owner: str) -> bytes:
-        """The bytes of an image, embedded or in a separate file."""
+        """The bytes of an image, embedded or in a separate file.
+
+        Raises:
+            FileNotFoundError: There is no regular file of its name.
+            ValueError: The image is missing or damaged, or outside of the folder.
+        """
         index = self.index("images", value, owner)
-        item = self.items("images")[index]
+        item, name = self.items("images")[index], f"image {index}"
         if "bufferView" in item:
-            return bytes(self.view(item["bufferView"], f"image {index}")[0])
-        return self._resource(item.get("uri"), f"image {index}")
+            return bytes(self.view(item["bufferView"], name)[0])
+        uri = item.get("uri")
+        if isinstance(uri, str) and uri and not _is_embedded(uri):
+            path = self._file(uri, name)
+            absence = inputs.absence(path)
+            if absence:
+                raise FileNotFoundError(f"{name}, {path}, {absence}")
+        return self._resource(uri, name)
 
     @functools.cached_property
     def _size(self) -> int:

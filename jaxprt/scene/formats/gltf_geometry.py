@@ -10,8 +10,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxprt import require
-from jaxprt.scene.formats.geometry import Geometry, cofactors, instances, join_geometries
-from jaxprt.scene.formats.gltf_file import DRACO, Document, Elements, check_required, excerpt
+from jaxprt.scene.formats.geometry import Geometry, cofactors, flat, instances, join_geometries, with_area
+from jaxprt.scene.formats.gltf_file import (
+    DRACO,
+    QUANTIZATION,
+    Document,
+    Elements,
+    check_required,
+    excerpt,
+    stated_extensions,
+)
 from jaxprt.scene.formats.gltf_nodes import Node, instance_count, joint_transforms, nodes
 from jaxprt.scene.formats.gltf_nodes import instances as instance_matrices
 
@@ -28,6 +36,8 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 # Attributes that are read, and their numbers of components.
 _ATTRIBUTES = {"POSITION": (3,), "NORMAL": (3,), "TANGENT": (4,), "COLOR_0": (3, 4)}
 _ATTRIBUTES |= {"TEXCOORD_0": (2,), "TEXCOORD_1": (2,)}
+_FRACTIONS = ("TEXCOORD_", "COLOR_", "WEIGHTS_")  # attributes whose integers are normalized (section 3.7.2.1)
+_ABOVE_1 = 1.01  # colors up to here are 1 and rounding
 # Bytes for each vertex, its joints, each triangle, and each primitive of a node, while a scene is loaded, as measured.
 _VERTEX, _JOINTS, _FACE, _PART = 300, 350, 70, 3000
 
@@ -132,11 +142,11 @@ def apply_skin(document: Document, geometry: Geometry, bound: Binding, matrices:
         ValueError: A vertex refers to a joint that the skin does not have.
     """
     joint, weight = bound
-    far = np.flatnonzero(((joint >= len(matrices)) & (weight > 0)).any(1))
+    far = np.flatnonzero((((joint < 0) | (joint >= len(matrices))) & (weight > 0)).any(1))
     if far.size:
         got = f"{len(far)} of {len(joint)} vertices that refer to others, the first to {joint[far[0]].tolist()}"
         raise document.error(f"must refer to joints 0 to {len(matrices) - 1} in {name}", got)
-    joint = np.minimum(joint, len(matrices) - 1)
+    joint = np.clip(joint, 0, len(matrices) - 1)
     with np.errstate(over="ignore", invalid="ignore"):  # meshes refuse positions that are not finite
         mean = np.zeros((len(joint), 3, 4))
         for column in range(joint.shape[1]):
@@ -220,6 +230,7 @@ def morph_change(
         if len(elements.value) != count:
             got = str(len(elements.value))
             raise document.error(f"must have {count} elements in {key} of {owner}, as in POSITION", got)
+        elements = _normalized(document, elements, key)
         difference = elements.numbers(used)
         if not np.isfinite(difference).all():
             wrong = np.flatnonzero(~np.isfinite(difference).all(1))
@@ -454,9 +465,15 @@ def read(document: Document, *, groups: bool = False, scene: Sequence[Node] | No
     mesh_of = [mesh for mesh in mesh_of if primitives[mesh]]
     _check_memory(document, drawn, mesh_of, primitives)
     parts, labels = [], []
+    vanished = 0
     for node, primitive, geometry in _placements(document, scene, drawn, mesh_of, primitives):
-        parts.append(geometry)
-        labels.append(node.number if groups else primitive.material)
+        vanished += primitive.face_count - len(geometry.face)
+        if len(geometry.face):
+            parts.append(geometry)
+            labels.append(node.number if groups else primitive.material)
+    if not parts and vanished:
+        got = f"{vanished} that nodes or joints scale to nothing"
+        raise document.error("must hold faces with an area", got)
     if not parts:
         extra = f" ({', '.join(sorted(ignored))} are not read)" if ignored else ""
         raise document.error("must hold vertices and faces", f"no faces{extra}")
@@ -494,12 +511,8 @@ def _primitives(document: Document, mesh: int, skinned: bool, draco: DracoReader
         if material is not None:
             material = document.index("materials", material, name)
         attribute = document.object(item, "attributes", name)
-        ignored |= {
-            key for key in attribute if key.startswith(("TEXCOORD_", "COLOR_")) and key[-2:] not in ("_0", "_1")
-        }
-        ignored |= {"COLOR_1"} & set(attribute)
         decoded = draco.primitive(item, name) or {}
-        elements = _elements(document, attribute, skinned, decoded, name)
+        elements = _elements(document, attribute, skinned, decoded, name, ignored)
         index = decoded.get("indices")
         mode = mode if index is None else _TRIANGLES
         if "indices" in item and index is None:
@@ -510,21 +523,33 @@ def _primitives(document: Document, mesh: int, skinned: bool, draco: DracoReader
             raise document.error(f"must have {must} corners of triangles in {name}", str(corners))
         sets = sum(key.startswith("JOINTS_") for key in elements)
         targets = document.array(item, "targets", name)
+        changed = {key for target in targets if isinstance(target, dict) for key in target}
+        unchanged = changed - (elements.keys() & _MORPHS.keys()) - {"NORMAL", "TANGENT"}
+        ignored |= {f"{key} of morph targets" for key in unchanged if not key.startswith("_")}
         primitives.append(Primitive(name, material, mode, index, elements, sets, targets))
     return primitives
 
 
 def _elements(
-    document: Document, attribute: dict[str, Any], skinned: bool, decoded: dict[str, Elements], name: str
+    document: Document,
+    attribute: dict[str, Any],
+    skinned: bool,
+    decoded: dict[str, Elements],
+    name: str,
+    ignored: set[str],
 ) -> dict[str, Elements]:
-    """The attributes of a primitive that are read; some may be decoded already."""
+    """The attributes of a primitive that are read; some may be decoded already. Adds what is not to `ignored`."""
     if "POSITION" not in attribute:
         raise document.error("must be an undamaged glTF file", f"one that lacks 'POSITION' in {name}")
-    widths = dict(_ATTRIBUTES)
+    widths: dict[str, tuple[int, ...]] = dict(_ATTRIBUTES)
     sets = 0
     while skinned and f"JOINTS_{sets}" in attribute and f"WEIGHTS_{sets}" in attribute:
         widths |= {f"JOINTS_{sets}": (4,), f"WEIGHTS_{sets}": (4,)}
         sets += 1
+    if skinned and not sets:
+        ignored.add("skins of primitives without JOINTS_0 and WEIGHTS_0")
+    bindings = () if skinned else ("JOINTS_", "WEIGHTS_")
+    ignored |= {key for key in attribute.keys() - widths.keys() if not key.startswith(("_", *bindings))}
     elements = {}
     for key, width in widths.items():
         if key in attribute:
@@ -535,7 +560,22 @@ def _elements(
             got, count = len(elements[key].value), len(elements["POSITION"].value)
             if got != count:
                 raise document.error(f"must have {count} elements in {key} of {name}, as in POSITION", str(got))
+            fraction = _normalized(document, elements[key], key)
+            if fraction is not elements[key]:
+                ignored.add(f"{key} of integers without normalized (they are read as normalized)")
+            elements[key] = fraction
+    color = elements["COLOR_0"].numbers() if "COLOR_0" in elements else np.zeros(0)
+    if not (np.abs(color - 0.5) <= _ABOVE_1 - 0.5).all():
+        ignored.add("COLOR_0 beyond 0 to 1 (colors are clipped)")
     return elements
+
+
+def _normalized(document: Document, elements: Elements, key: str) -> Elements:
+    """Integers as normalized ones where an attribute has no others. Quantized texture coordinates may have any."""
+    plain = elements.value.dtype.kind == "f" or elements.most or not key.startswith(_FRACTIONS)
+    if plain or (key.startswith("TEXCOORD_") and QUANTIZATION in stated_extensions(document)):
+        return elements
+    return elements._replace(most=int(np.iinfo(elements.value.dtype).max))
 
 
 def _check_memory(
@@ -587,13 +627,14 @@ def _placements(
     skins = _skins(document, scene, drawn, mesh_of, primitives)
     for node, shape, matrix in zip(drawn, shapes, matrices, strict=True):
         skin, listed = skins.get(node.number), primitives[shape[0]]
-        for _ in matrix:
+        flattens = flat(matrix) if skin is None else np.repeat(flat(skin).any(), len(matrix))
+        for flattened in flattens:
             for primitive, (geometry, binding), rest in zip(listed, bound[shape], placed[shape], strict=True):
                 here = next(rest)
                 if skin is not None and binding is not None:
                     here = apply_skin(document, geometry, binding, skin, primitive.name)
                     here = here._replace(normal=_face_normals(here.position[here.face])) if primitive.flat else here
-                yield node, primitive, here
+                yield node, primitive, with_area(here) if flattened else here
 
 
 def _skins(

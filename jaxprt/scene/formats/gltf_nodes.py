@@ -9,12 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxprt.files import inputs
 from jaxprt.scene.formats.gltf_file import INSTANCING, LARGEST_FLOAT, Document, Elements, excerpt
 
 _TRANSFORM = {"TRANSLATION": (3,), "ROTATION": (4,), "SCALE": (3,)}  # attributes of instances, and their components
 _CHANNEL_WIDTH = {"translation": 3, "rotation": 4, "scale": 3, "weights": 1}
 _INTERPOLATION = ("LINEAR", "STEP", "CUBICSPLINE")
 _POINTER = "KHR_animation_pointer"
+_AFFINE = 1e-5  # deviation of the last row of a matrix from 0 0 0 1, due to rounding
 _STRAIGHT = 1e-9  # sine of the angle between two rotations below which their mean is linear
 
 
@@ -108,7 +110,7 @@ def instance_count(document: Document, node: Node) -> int:
         raise document.error(f"must have TRANSLATION, ROTATION or SCALE in {owner}", "none")
     counts = {key: len(elements.value) for key, elements in attributes.items()}
     if len(set(counts.values())) > 1:
-        raise document.error(f"must have attributes of one count in {owner}", f"{counts}")
+        raise document.error(f"must have attributes of one count in {owner}", excerpt(counts))
     return next(iter(counts.values()))
 
 
@@ -153,7 +155,7 @@ def _instance_attributes(document: Document, node: Node) -> dict[str, Elements] 
     attribute = document.object(document.object(extensions, INSTANCING, owner), "attributes", owner)
     # Attributes of other names are for applications, but they count instances too.
     return {
-        key: document.accessor(value, f"{key} of {owner}", *_TRANSFORM.get(key, (1, 2, 3, 4)))
+        key: document.accessor(value, f"{inputs.shortened(key)} of {owner}", *_TRANSFORM.get(key, (1, 2, 3, 4)))
         for key, value in attribute.items()
     }
 
@@ -246,6 +248,10 @@ def _transforms(document: Document, order: list[int]) -> np.ndarray:
     local[rows, :3, 3] = translation
     rows, matrix = values("matrix", 16)
     local[rows] = matrix.reshape(-1, 4, 4).transpose(0, 2, 1)
+    wrong = np.flatnonzero((np.abs(local[:, 3] - [0, 0, 0, 1]).max(1) > _AFFINE) & local.any((1, 2)))
+    if wrong.size:
+        must = f"must have a matrix by columns, the last row of which is 0 0 0 1, in node {order[wrong[0]]}"
+        raise document.error(must, str(local[wrong[0], 3].tolist()))
     return local
 
 
@@ -335,7 +341,9 @@ def _animation_index(document: Document, animation: str | int | None) -> int:
         return number
     names = [item.get("name") for item in items]
     if animation not in names:
-        raise document.error(f"must have an animation of the name {animation!r}", f"those of the names {names}")
+        raise document.error(
+            f"must have an animation of the name {animation!r}", f"those of the names {excerpt(names)}"
+        )
     return names.index(animation)
 
 
@@ -354,6 +362,8 @@ def _sampler(document: Document, samplers: list, value: Any, path: str, name: st
         must = f"must have finite times from 0 on in ascending order in {name}"
         raise document.error(must, f"{keys[wrong]:g} s at key {wrong}")
     values = document.accessor(item.get("output"), f"values of {name}", _CHANNEL_WIDTH[path])
+    if path == "weights" and values.value.dtype.kind != "f" and not values.most:
+        raise document.error(f"must have floats or normalized integers as values of {name}", "others")
     size = len(keys) * (3 if kind == "CUBICSPLINE" else 1)
     count = len(values.value)
     if count % size if path == "weights" else count != size:

@@ -264,10 +264,9 @@ def test_images_that_cannot_be_read_are_left_out_and_named(tmp_path):
     writer.header["images"][0] = {"uri": "data:image/png;base64,AAAA"}
     with pytest.warns(UserWarning, match=r"textures that cannot be read \(image 0, data:image/png;base64,AAAA must be"):
         load_scene(writer.write(path))
-    # One that is not there can be put there, so that is an error.
     writer.header["images"][0] = {"uri": "gone.png"}
-    with pytest.raises(FileNotFoundError, match=r"gone\.png must be the file that .*a\.glb needs for image 0"):
-        load_scene(writer.write(path))
+    with pytest.warns(UserWarning, match=r"that cannot be read \(image 0, .*gone\.png, which does not exist\)"):
+        assert load_scene(writer.write(path))["a"].material.textures == ()
 
 
 def test_signaling_nans_are_refused_like_others(tmp_path):

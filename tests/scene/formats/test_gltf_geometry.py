@@ -181,6 +181,86 @@ def test_damaged_instances_are_refused(tmp_path, attribute, message):
         load_scene(writer.write(tmp_path / "a.glb"))
 
 
+def read(writer, folder):
+    """The only part of a file."""
+    (part,) = load_scene(writer.write(folder / "a.glb")).parts
+    return part
+
+
+@pytest.mark.parametrize("kind", ["u1", "u2"])
+@pytest.mark.parametrize(("key", "value"), [("COLOR_0", np.tile([0.2, 0.4, 0.6], (4, 1))), ("TEXCOORD_0", PLACE)])
+def test_integers_that_should_be_normalized_are_read_so_with_a_warning(tmp_path, kind, key, value):
+    most = np.iinfo(kind).max
+    writer = Writer()
+    one(writer.square(**{key: writer.accessor((value * most).astype(kind))}), writer=writer)
+    with pytest.warns(UserWarning, match=rf"ignored are {key} of integers without normalized \(they are read as norm"):
+        part = read(writer, tmp_path)
+    writer.header["accessors"][0]["normalized"] = True
+    same = read(writer, tmp_path)
+    for shown in (part, same):
+        got = shown.color if key == "COLOR_0" else np.asarray(shown.mesh.texture) * [1, -1] + [0, 1]
+        np.testing.assert_allclose(got, value, atol=1 / most)
+
+
+def test_quantized_texture_coordinates_are_whole_numbers(tmp_path):
+    writer = Writer()
+    one(writer.square(TEXCOORD_0=writer.accessor((3 * PLACE).astype(np.uint8))), writer=writer)
+    writer.header["extensionsUsed"] = ["KHR_mesh_quantization"]
+    np.testing.assert_array_equal(read(writer, tmp_path).mesh.texture, [0, 1] + PLACE * [3, -3])
+
+
+def test_what_is_not_read_of_primitives_is_named(tmp_path):
+    writer = Writer()
+    primitive = writer.square(COLOR_0=np.full((4, 3), 200.0), UV=PLACE, _OWN=PLACE, TEXCOORD_2=PLACE)
+    one(primitive | {"targets": [{"TEXCOORD_1": 0, "POSITION": 0, "NORMAL": 0}]}, writer=writer)
+    writer.header["skins"] = [{"joints": [0]}]
+    writer.header["nodes"][0] |= {"skin": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}
+    expected = r"COLOR_0 beyond 0 to 1 \(colors are clipped\), KHR_node_visibility, TEXCOORD_1 of morph targets, "
+    expected += "TEXCOORD_2, UV, skins of primitives without JOINTS_0 and WEIGHTS_0"
+    with pytest.warns(UserWarning, match=rf"not supported and ignored are {expected}$"):
+        read(writer, tmp_path)
+
+
+FLATTENED = {"scale": [0, 0, 0]}, {"scale": [1, 0, 1]}, {"scale": [0, 3, 0]}, {"matrix": [0.0] * 16}
+
+
+@pytest.mark.parametrize("flattened", FLATTENED)
+def test_faces_that_a_node_scales_to_nothing_are_left_out(tmp_path, flattened):
+    writer = one((writer := Writer()).square(), writer=writer)
+    turned = {"rotation": TILT.as_quat().tolist(), "translation": [50, 60, 70], "children": [2]}
+    writer.header["nodes"] = [{"mesh": 0}, turned, {"mesh": 0} | flattened]
+    writer.header["scenes"][0]["nodes"] = [0, 1]
+    np.testing.assert_array_equal(read(writer, tmp_path).mesh.position, SQUARE)
+    writer.header["scenes"][0]["nodes"] = [1]
+    message = r"a\.glb must hold faces with an area, got 2 that nodes or joints scale to nothing"
+    with pytest.raises(ValueError, match=message):
+        read(writer, tmp_path)
+
+
+def test_faces_that_keep_an_area_in_a_plane_stay(tmp_path):
+    """A cube that is flattened has its two ends, and no sides."""
+    cube = trimesh.creation.box()
+    writer = Writer()
+    normal, face = np.float32(cube.vertices), cube.faces.ravel().astype(np.uint16)
+    one(writer.square(POSITION=np.float32(cube.vertices), NORMAL=normal, face=face), writer=writer)
+    writer.header["nodes"][0] |= {"scale": [1, 1, 0], "rotation": TILT.as_quat().tolist()}
+    mesh = read(writer, tmp_path).mesh
+    assert mesh.face.shape == (4, 3)
+    corner = triangles(mesh)
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) / 2
+    np.testing.assert_allclose(area, 0.5, rtol=1e-6)
+
+
+def test_joints_may_scale_faces_to_nothing(tmp_path):
+    writer = Writer()
+    binding = {"JOINTS_0": np.zeros((4, 4), np.uint8), "WEIGHTS_0": np.eye(4, dtype=np.float32)[[0] * 4]}
+    one(writer.square(**binding), writer.square(), writer=writer)
+    writer.header["nodes"] = [{"mesh": 0, "skin": 0}, {"scale": [0, 0, 0], "translation": [9, 9, 9]}]
+    writer.header |= {"skins": [{"joints": [1]}], "scenes": [{"nodes": [0, 1]}]}
+    with pytest.warns(UserWarning, match="skins of primitives without JOINTS_0"):
+        np.testing.assert_array_equal(read(writer, tmp_path).mesh.position, SQUARE)
+
+
 def test_required_extensions_that_are_not_known_are_refused_by_name_and_optional_ones_are_warned_of(tmp_path):
     writer = one((writer := Writer()).square(), writer=writer)
     path = tmp_path / "a.glb"
@@ -342,6 +422,7 @@ def test_of_the_nodes_outside_of_the_scene_only_joints_and_their_ancestors_are_r
     ("joint", "weight", "inverse", "message"),
     [
         (JOINT + 1, WEIGHT, SHIFTED, "refer to joints 0 to 1 in primitive 0 of mesh 0, got 3 of 4 vertices"),
+        (np.int8(JOINT) - 1, WEIGHT, SHIFTED, "refer to joints 0 to 1 in primitive 0 of mesh 0, got"),
         (JOINT, -WEIGHT, SHIFTED, "weights of joints of at least 0 in primitive 0 of mesh 0, got 4 of 4"),
         (JOINT, WEIGHT * np.nan, SHIFTED, "weights of joints of at least 0"),
         (JOINT, WEIGHT, SHIFTED[:1], "an inverse bind matrix for each of the 2 joints of skin 0, got 1"),

@@ -164,6 +164,9 @@ DAMAGE = {
     r"must have no matrix in node 1, which channel 0 of animation 0 moves": lambda h: h["nodes"][1].update(
         matrix=np.eye(4).ravel().tolist()
     ),
+    r"must have floats or normalized integers as values of channel 3 of animation 0, got others": lambda h: h[
+        "animations"
+    ][0]["samplers"][3].update(output=h["bytes"]),
     r"must have 2 finite numbers for the weights of node 2, one for each morph target": lambda h: h["animations"][0][
         "samplers"
     ][3].update(output=h["nine"]),
@@ -182,6 +185,7 @@ def test_damaged_animations_are_refused(tmp_path, message):
     writer.header["odd"] = writer.accessor(np.float32([0, 2, 1, 3]))
     writer.header["four"] = writer.accessor(np.float32([0, 1, 2, 3]))
     writer.header["nine"] = writer.accessor(np.zeros(9, np.float32))
+    writer.header["bytes"] = writer.accessor(np.zeros(18, np.uint8))
     writer.header["few"] = writer.accessor(np.ones((3, 3), np.float32))
     DAMAGE[message](writer.header)
     with pytest.raises(ValueError, match=rf"a\.glb.*({message})"):

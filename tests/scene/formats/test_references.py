@@ -114,7 +114,7 @@ def test_they_are_read_where_the_user_allows_it(place, kind):
             assert material.base_color_texture is not None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        if kind in (scene_of_buffer, scene_of_image):
+        if kind is scene_of_buffer:
             with pytest.raises(FileNotFoundError, match="absent"):
                 load_scene(kind(place, "../absent" + KINDS[kind]), outside=True)
 
@@ -200,9 +200,8 @@ def test_drives_in_libraries_are_names_like_others_elsewhere(place):
 @pytest.mark.parametrize("name", ["a\0b", "a" * 300, "a/" * 3000, "circle", "circle/a"])
 def test_names_that_no_file_can_have_are_refused(place, name, outside):
     (place / "circle").symlink_to("circle")
-    for kind in (scene_of_buffer, scene_of_image):
-        with pytest.raises((ValueError, FileNotFoundError), match=r"a\.gl"):
-            load_scene(kind(place, urllib.parse.quote(name)), outside=outside)
+    with pytest.raises((ValueError, FileNotFoundError), match=r"a\.gl"):
+        load_scene(scene_of_buffer(place, urllib.parse.quote(name)), outside=outside)
     if "\0" in name:
         with pytest.raises(ValueError, match=r"a\.mtl must be an MTL file, got one that is not text"):
             load_scene(scene_of_map(place, name))
@@ -211,19 +210,19 @@ def test_names_that_no_file_can_have_are_refused(place, name, outside):
         with pytest.raises(ValueError, match=r"a\.mtl, map_Kd of material 'a' must refer to a file"):
             load_scene(scene_of_map(place, name))
         return
-    with pytest.warns(UserWarning, match=r"map_Kd \(.*, which (is not a regular file|does not exist)\)"):
-        load_scene(scene_of_map(place, name), outside=outside)
+    for kind in (scene_of_map, scene_of_image):
+        with pytest.warns(UserWarning, match=r"ignored are .*, which (is not a regular file|does not exist)\)"):
+            load_scene(kind(place, name), outside=outside)
 
 
 def test_pipes_and_folders_in_place_of_files_are_refused_at_once(place):
     os.mkfifo(place / "pipe")
-    for kind in (scene_of_buffer, scene_of_image):
-        for name, what in (("pipe", "special file"), ("inner", "directory"), (".", "directory")):
-            with pytest.raises(ValueError, match=rf"must be the file that .*a\.gl\w+ needs for \w+ 0, got a {what}"):
-                load_scene(kind(place, name))
-        with pytest.raises(ValueError, match="got a special file"):
-            load_scene(kind(place, "/dev/zero"), outside=True)
-    for kind in (scene_of_library, scene_of_map):
+    for name, what in (("pipe", "special file"), ("inner", "directory"), (".", "directory")):
+        with pytest.raises(ValueError, match=rf"must be the file that .*a\.gltf needs for buffer 0, got a {what}"):
+            load_scene(scene_of_buffer(place, name))
+    with pytest.raises(ValueError, match="got a special file"):
+        load_scene(scene_of_buffer(place, "/dev/zero"), outside=True)
+    for kind in (scene_of_library, scene_of_map, scene_of_image):
         with pytest.warns(UserWarning, match="pipe, which is not a regular file"):
             load_scene(kind(place, "pipe"))
     for suffix in (".gltf", ".glb"):
@@ -259,6 +258,52 @@ def test_a_backslash_may_belong_to_a_name(tmp_path):
     (tmp_path / name).touch()
     path = inputs.reference(name, tmp_path, folder=tmp_path, owner="a scene", outside=False)
     assert path == tmp_path / pathlib.Path(name)
+
+
+NAMES = {"Wood.PNG": "wood.png", "Bilder/gr\u00f6\u00dfe": "bilder/gro\u0308\u00dfe"}  # in the scene, and of the file
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", NAMES)
+def test_names_may_differ_from_those_of_files_in_case_and_unicode_form(place, kind, name):
+    suffix, path = KINDS[kind], place / NAMES[name]
+    path.parent.mkdir(exist_ok=True)
+    shutil.copy(place.parent / f"secret{suffix}", f"{path}{suffix}")
+    load_scene(kind(place, name + suffix))  # without a warning
+
+
+def test_names_that_several_files_could_have_are_those_of_none(place):
+    for name in ("Wood.png", "WOOD.png"):
+        write_png(place / name, GRAY)
+    with pytest.warns(UserWarning, match=r"wood\.png, which does not exist"):
+        load_scene(scene_of_map(place, "wood.png"))
+    assert load_scene(scene_of_map(place, "WOOD.png")).parts[0].material.textures
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_links_out_of_the_folder_are_refused_in_other_letters_too(place, kind):
+    for name in (
+        "LINK",
+        "Linked",
+        "FOLDER/secret",
+        "FOLDER/SECRET",
+        "Folder/absent",
+        "../SECRET",
+        "INNER/../../secret",
+    ):
+        with pytest.raises(ValueError, match=OUTSIDE):
+            load_scene(kind(place, name + KINDS[kind]))
+    # Folders outside are not searched, even where files in them are allowed.
+    assert inputs.reference("../Secret.png", place, folder=place, owner="", outside=True) == place / "../Secret.png"
+    assert not inputs.reference("FOLDER/SECRET.png", place, folder=place, owner="", outside=True).exists()
+
+
+@pytest.mark.parametrize("kind", [scene_of_image, scene_of_map, scene_of_library])
+def test_messages_shorten_names_that_are_data(place, kind):
+    uri = "data:image/png;base64," + "A" * 10**6
+    with pytest.warns(UserWarning, match="not supported and ignored are") as caught:
+        load_scene(kind(place, uri))
+    assert len(str(caught[0].message)) < 2000
 
 
 @pytest.mark.usefixtures("unchecked")
