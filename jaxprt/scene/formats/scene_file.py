@@ -43,7 +43,8 @@ def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
     Raises:
         FileNotFoundError: The file does not exist.
         ValueError: The file is of an unknown kind, damaged or empty, has positions that are not finite, faces that
-            refer to missing vertices, or only faces without area. An OBJ file truncated between two faces cannot be detected.
+            refer to missing vertices, or only faces without area. An OBJ file truncated between two faces
+            cannot be detected.
     """
     path = pathlib.Path(path)
     return from_file(mesh_file.read(path, groups=groups), path)
@@ -136,8 +137,8 @@ def load_scene(
         FileNotFoundError: The file, or a buffer of a glTF file, does not exist. Images that do not are warned of.
         ImportError: The file is compressed, and a package of `jaxprt[web]` is missing.
         ValueError: The file is of an unknown kind, damaged, or has no triangles with an area; it refers to a file
-            outside of its folder, or requires an unknown extension; a factor is not finite or out of range; or a BSDF of a dictionary
-            is not supported.
+            outside of its folder, or requires an unknown extension; a factor is not finite or out of range; or a BSDF
+            of a dictionary is not supported.
         MemoryError: The scene does not fit into memory.
     """
     if not isinstance(outside, bool):
