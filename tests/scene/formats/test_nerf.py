@@ -54,18 +54,84 @@ def test_focal_lengths_stand_for_the_angle(tmp_path):
     np.testing.assert_allclose(nerf.load(path)[0].field_of_view, 0.7, rtol=1e-6)
 
 
+FOCAL = 0.5 * 40 / np.tan(0.5 * nerf.horizontal_angle(CAMERA))
+MATRIX = nerf.matrix(CAMERA).tolist()
+SMALLER = 2 * np.arctan(0.5 * np.tan(0.35))  # the vertical angle of twice the focal length
+
+
+@pytest.mark.parametrize("of_frame", [{"fl_x": 2 * FOCAL}, {"fl_y": 2 * FOCAL}, {"camera_angle_y": SMALLER}], ids=str)
+@pytest.mark.parametrize("of_file", [{}, {"fl_x": FOCAL, "fl_y": FOCAL}, {"camera_angle_y": 0.7}], ids=str)
+def test_a_focal_length_of_a_frame_replaces_all_of_the_file(tmp_path, of_file, of_frame):
+    frames = [{"transform_matrix": MATRIX}, {"transform_matrix": MATRIX} | of_frame]
+    whole, own = nerf.load(written(tmp_path / "transforms.json", frames=frames, **of_file))
+    np.testing.assert_allclose([whole.field_of_view, own.field_of_view], [0.7, SMALLER], rtol=1e-6)
+
+
+def test_fields_of_a_pinhole_and_of_training_are_read_in_silence(tmp_path):
+    plain = {"camera_model": "OPENCV", "is_fisheye": False, "k1": 0, "k6": 0.0, "distortion_params": [0, 0], "w": 40.0}
+    plain |= {"fl_x": None, "aabb_scale": 16, "applied_transform": np.eye(4)[:3].tolist(), "applied_scale": 1.0}
+    frame = {"transform_matrix": MATRIX[:3], "file_path": "a.png", "rotation": 0.01, "sharpness": 30.0, "w": None}
+    (camera,) = nerf.load(written(tmp_path / "transforms.json", frames=[frame], **plain))
+    assert (camera.width, camera.height) == (40, 30)
+    np.testing.assert_allclose(camera.eye, CAMERA.eye, atol=1e-6)
+    np.testing.assert_allclose(camera.field_of_view, 0.7, rtol=1e-6)
+
+
+def test_one_warning_names_all_fields_that_are_not_read(tmp_path):
+    moved = {"applied_transform": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]], "applied_scale": 0.5, "empty": []}
+    path = written(tmp_path / "transforms.json", frames=[{"transform_matrix": MATRIX, "time": 0.5}] * 2, **moved)
+    with pytest.warns(UserWarning, match="not supported") as caught:
+        nerf.load(path)
+    (message,) = [str(warning.message) for warning in caught]
+    assert message == "transforms.json: not supported and ignored are applied_scale, applied_transform, time"
+
+
+def framed(*rows):
+    return {"frames": [{"transform_matrix": [*rows, *MATRIX[len(rows) :]]}]}
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({"frames": []}, "must have a list of frames"),
+        ({"frames": [[]]}, "frame 0 must be an object with a transform_matrix, got"),
         ({"frames": [{}]}, "frame 0 must have a transform_matrix of 4 x 4 finite numbers"),
-        ({"frames": [{"transform_matrix": np.zeros((4, 4)).tolist()}]}, "axes that are not orthogonal"),
-        ({"frames": [{"transform_matrix": np.diag([1.0, 1, -1, 1]).tolist()}]}, "axes that are not orthogonal"),
-        ({"camera_angle_x": 4}, "camera_angle_x between 0 and pi"),
-        ({"camera_angle_x": "wide"}, "a finite number as camera_angle_x"),
-        ({"k1": 0.1}, "must be a pinhole camera"),
-        ({"cx": 5}, "its axis in the center"),
-        ({"fl_x": 30, "fl_y": 60}, "square pixels"),
+        (framed(["1", 0, 0, 0]), "a transform_matrix of 4 x 4 finite numbers, got"),
+        (framed([True, 0, 0, 0]), "a transform_matrix of 4 x 4 finite numbers, got"),
+        (framed([1, 0, 0, 10**400]), "a transform_matrix of 4 x 4 finite numbers, got"),
+        (framed([1, 0, 0, np.nan]), "a transform_matrix of 4 x 4 finite numbers, got"),
+        (framed([[1, 0, 0, 0]] * 4), "a transform_matrix of 4 x 4 finite numbers, got"),
+        (framed(*MATRIX[:3], [0, 0, 0, 2]), r"the last row 0 0 0 1, got \[0, 0, 0, 2\]"),
+        (framed(*np.transpose(MATRIX).tolist()), "the last row 0 0 0 1"),
+        (framed(*np.zeros((3, 4)).tolist()), "axes that are not orthogonal"),
+        (framed(*np.diag([1.0, 1, -1, 1]).tolist()), "axes that are not orthogonal"),
+        (framed(*np.diag([1.0, 1, 2, 1]).tolist()), r"got axes of lengths \[1.0, 1.0, 2.0\]"),
+        *[({"camera_angle_x": angle}, "camera_angle_x between 0 and pi, got") for angle in (4, 0, -1, 5e-324)],
+        *[({"camera_angle_x": x}, "a finite number as camera_angle_x, got") for x in ("1", True, [1], {}, np.inf)],
+        ({"camera_angle_x": None}, "camera_angle_x between 0 and pi, or fl_x with w and h, got none"),
+        ({"camera_angle_x": 3.14159265}, "frame 0: the camera's field_of_view must be between"),
+        *[({"w": size}, "a whole number of pixels, at least 1, as w, got") for size in (0, 32.5, -4)],
+        ({"w": 10**400}, "a finite number as w, got 1000"),
+        ({"w": None}, "both w and h or none, got h alone"),
+        ({"w": 1e30}, "frame 0: a picture must have at most .* pixels"),
+        ({"fl_x": 2 * FOCAL}, "one focal length in pixels, .*square, got .* by fl_x, .* by camera_angle_x"),
+        ({"fl_x": FOCAL, "fl_y": 2 * FOCAL}, "one focal length in pixels, .*square, got"),
+        (
+            {"camera_angle_y": 0.8},
+            "one focal length in pixels, .*square, got .* by camera_angle_x, .* by camera_angle_y",
+        ),
+        ({"w": None, "h": None, "camera_angle_y": 0.7}, "one focal length in widths of a square picture"),
+        ({"w": None, "h": None, "fl_x": FOCAL}, "w and h beside a focal length in pixels, got fl_x"),
+        ({"w": None, "h": None, "cx": 20}, "w and h beside the principal point, got cx = 20 alone"),
+        ({"fl_y": 0}, "must have fl_y above 0, got 0"),
+        ({"cx": 5}, "its axis in the center, got cx = 5 of 40 pixels"),
+        ({"shift_x": 0.1}, "must be a pinhole camera, got shift_x = 0.1"),
+        *[({key: 0.1}, f"must be a pinhole camera, got {key} = 0.1") for key in ("k1", "k4", "k6", "p2", "s1", "b2")],
+        *[({"k1": k}, "must be a pinhole camera, got k1") for k in ("0", np.nan, True, [[0.1]])],
+        *[({key: True}, f"must be a pinhole camera, got {key}") for key in ("is_fisheye", "ortho", "latlong")],
+        *[({"camera_model": x}, "with camera_model one of") for x in ("OPENCV_FISHEYE", "EQUIRECTANGULAR", 3, [""])],
+        ({"camera_type": "fisheye"}, "with camera_type one of"),
+        ({"camera_convention": "opencv"}, "with camera_convention one of BLENDER, OPENGL, got 'opencv'"),
     ],
     ids=str,
 )
