@@ -333,7 +333,7 @@ def hostile(folder: pathlib.Path, quick: bool) -> Iterator[dict[str, Any]]:
         picture(prt.precompute(sphere(8, material), **options), camera)
     on_floor = np.array([0.5, 0.0, 0.5])
     for eye in (on_floor, np.array([0.0, 2.0, 0.0])):
-        picture(relit, Camera(eye, eye + [0.3, 0.1, 0.2], width=16, height=16))
+        picture(relit, Camera(eye, eye + [0.3, 0.1, 0.2], [0.0, 1, 0], 0.6, 16, 16))
     for width, height in ((1, 1), (1, 10_000), (10_000, 1)):
         check(picture(relit, orbit(relit.mesh, width=width, height=height)).shape[:2] == (height, width), "a size")
     worst = max(errors, key=lambda name: errors[name])

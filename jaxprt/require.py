@@ -23,6 +23,7 @@ Function = TypeVar("Function", bound=Callable)
 LARGEST = 1e32  # magnitude of numbers that enter: sums over all texels and small factors fit into float32
 _ORTHOGONAL = 1e-4  # deviation of M M^T from the identity, due to rounding
 _MOST = 2**31 - 1  # largest index of 32 bits
+_AXES = 64  # most axes of an array in NumPy
 
 
 def real(name: str, value: Any) -> None:
@@ -63,8 +64,17 @@ def _array_of(value: Any) -> Any:
         try:
             return convert(value)
         except (TypeError, ValueError, OverflowError):
-            pass
+            if _is_too_deep(value):  # JAX would recurse until Python's stack is spent for good.
+                break
     return None
+
+
+def _is_too_deep(value: Any) -> bool:
+    """Whether lists hold themselves, or are nested more deeply than arrays have axes."""
+    level = [value]
+    for _ in range(_AXES + 1):
+        level = list({id(row): row for rows in level if isinstance(rows, list | tuple) for row in rows}.values())
+    return bool(level)
 
 
 def floating(value: Any, *, dtype: Any = None) -> Any:
@@ -444,5 +454,8 @@ def shown(value: Any) -> str:
     """A value in at most 40 letters, and its class."""
     if isinstance(value, jax.Array | np.ndarray):
         return _describe(value)
-    text = repr(value)
+    try:
+        text = repr(value)
+    except RecursionError:
+        text = "lists or objects that are nested too deeply"
     return f"{text if len(text) <= 40 else text[:37] + '...'} of class {type(value).__name__}"

@@ -104,6 +104,18 @@ def test_lists_that_hold_traced_values_are_positions():
         require.number("error", 2**70, 0.0)
 
 
+def test_lists_that_hold_themselves_are_no_numbers_and_leave_the_stack_as_it_was():
+    """JAX would recurse in them until no function can be called any more."""
+    loop, deep = [1.0], [1.0]
+    loop.append(loop)
+    for _ in range(5000):
+        deep = [deep]
+    for value in (loop, deep):
+        with pytest.raises(TypeError, match="the eye must be real numbers, got one of class list"):
+            require.position("the eye", value)
+    assert require.shown(deep) == "lists or objects that are nested too ... of class list"
+
+
 @pytest.mark.parametrize(
     "wrong", [np.eye(2), 2 * np.eye(3), np.diag([1, 1, -1]), np.full((3, 3), np.nan), 5, np.eye(4)]
 )
