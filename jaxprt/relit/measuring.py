@@ -96,6 +96,8 @@ def measure(scene: Any, environments: Sequence[Environment]) -> Report:
         environments: Environments of one size.
     """
     size, mesh, shadings = check_lights(environments, 1.0, 1.0), scene.mesh, scene.shading
+    for light in environments:
+        protocol.light_for(scene, light)
     lamps = Lamps.of(centered(scene.scene), shadings)
     direct, views = scene.without_bounces(), views_around(mesh)
     seen = [direct.view(jnp.asarray(eye)) for eye in views]

@@ -33,6 +33,7 @@ from jaxprt.relit.tracing import Reflections
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.points import Points
 from jaxprt.systems.lamps import LampTransport
+from jaxprt.systems.protocol import light_for
 
 _TAKEN = ("rest", "background", *outputs.LAYERS)  # names that regions cannot have
 _ROUNDED = 1e-4  # of sums of shares
@@ -75,6 +76,8 @@ class PictureView(eqx.Module):
         shares: The texels that were traced when the view was made; None to choose them by each light.
         lamp_rays: Whether rays from the points are traced to lamps; otherwise their light is interpolated.
         lamps: Names of the lamps.
+        light_size: As of the scene; see `System.light_size`.
+        light_step: As of the scene; see `System.light_step`.
     """
 
     stage: Stage
@@ -90,6 +93,8 @@ class PictureView(eqx.Module):
     shares: TexelShares | None = None
     lamp_rays: bool = eqx.field(static=True, default=False)
     lamps: tuple[str, ...] = eqx.field(static=True, default=())
+    light_size: int | None = eqx.field(static=True, default=None)
+    light_step: int = eqx.field(static=True, default=1)
 
     @promoted
     def picture(
@@ -119,8 +124,7 @@ class PictureView(eqx.Module):
         between: Between = None,
     ) -> list[Any]:
         """What `picture` returns for each of several lights. All that depends on the view is computed once for all."""
-        for environment in environments:
-            _check_light("the light", environment)
+        check(self, environments)
         _check_background(background)
         names = ("color",) if layers is None else check_layers(layers)
         shown = [name for name in LIGHT if name in names]
@@ -163,7 +167,7 @@ class PictureView(eqx.Module):
             ValueError: A name is that of another layer, or the shares of a region are not [6, n, n] finite numbers from
                 0 to 1 as the environment has texels.
         """
-        _check_light("the light", environment)
+        check(self, [environment])
         parts = _regions(environment, {} if regions is None else regions, (*self.lamps, *_TAKEN))
         black = Environment(jnp.zeros_like(environment.radiance))
         none, alone = np.zeros(len(self.lamps)), np.eye(len(self.lamps))
@@ -306,6 +310,15 @@ class PictureLight(NamedTuple):
     def of_row(self, number: int | None, glow: Float[Array, " p"] | None) -> RowLight:
         """The light of a row; `number` is its index among the rows of sharp groups, None for others."""
         return RowLight(self.arriving, self.traced, None if number is None else self.reflections[number], glow)
+
+
+def check(taker: Any, environments: Sequence[Any], shadows: Any = "rays") -> None:
+    """Refuses what is not one light of a size that a scene, or a view of it, takes, and shadows that are not text."""
+    if not isinstance(shadows, str):
+        raise TypeError(f'shadows must be "rays" or "vertices", got {require.shown(shadows)}')
+    for environment in environments:
+        _check_light("the light", environment)
+        light_for(taker, environment)
 
 
 def _check_light(what: str, environment: Any) -> None:
@@ -453,7 +466,7 @@ def _points(picture: PictureView, index: Any) -> tuple[Points, Points]:
 
 def make(
     stage: Stage,
-    arriving: Callable[..., Arriving],
+    arriving: "SceneLighting",
     camera: Camera,
     *,
     samples: int,
@@ -477,7 +490,9 @@ def make(
     Raises:
         ValueError: `samples` is not 1, 4 or 16, or `shadow` is another word.
     """
-    if not isinstance(shadow, Environment) and shadow not in ("rays", "vertices"):
+    if isinstance(shadow, Environment):
+        check(arriving.scene, [shadow])
+    elif shadow not in ("rays", "vertices"):
         raise ValueError(f'shadows must be "rays", "vertices" or an Environment, got {require.shown(shadow)}')
     samples, camera, fold = drawn(camera, samples)
     with compile_time(stage.mesh, camera, stage.bend) if stage.sharp_groups else contextlib.nullcontext():
@@ -508,7 +523,9 @@ def make(
         shares = None if traced is None else put(traced.shares)
     else:
         way = shadow
+    scene = arriving.scene
     more = {"shares": shares, "lamp_rays": rays, "lamps": lamps}
+    more |= {"light_size": scene.light_size, "light_step": scene.light_step}
     return PictureView(stage, arriving, camera, pixels, ray, tuple(complete), reflected, fold, way, keep, **more)
 
 

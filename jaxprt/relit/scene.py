@@ -204,9 +204,7 @@ class RelitScene(System):
     @promoted
     def light(self, environment: Environment) -> SceneLight:
         """Projects an environment, of one color or three, for the systems of all groups."""
-        colors = protocol.one_light(environment).radiance.shape[-1]
-        if colors not in (1, 3):
-            raise ValueError(f"the light of a scene must have 1 or 3 colors, got {colors}")
+        require.colors("the light", protocol.light_for(self, environment).radiance)
         return groups.light(self.surfaces, self.bounces, environment)
 
     @promoted
@@ -433,6 +431,7 @@ class RelitScene(System):
         materials: Mapping[str, Any] | None = None,
     ) -> Float[Array, "*l v c"]:
         """Radiance that each vertex sends to the eye, including emission; see `jaxprt.radiance`."""
+        environment = protocol.light_for(self, environment, batch=True)
         of_parts, changed = scene_lamps.split(self.lamps, materials)
         return protocol.radiance(self, environment, eye=eye, materials={**self.appearances(of_parts), **changed})
 
@@ -503,11 +502,10 @@ class RelitScene(System):
         Raises:
             TypeError: `environment` is not an `Environment`, `camera` is not a `Camera`, or for the reasons that `view`
                 gives.
-            ValueError: The environment is a batch, `samples` is another number, `background` or `layers` is none of the
-                above, or for the reasons that `view` gives.
+            ValueError: The environment is a batch or of another size than the scene takes, `samples` is another number,
+                `background` or `layers` is none of the above, or for the reasons that `view` gives.
         """
-        if not isinstance(shadows, str):
-            raise TypeError(f'shadows must be "rays" or "vertices", got {require.shown(shadows)}')
+        pictures.check(self, [environment], shadows)
         view = self._picture_view(camera, materials, samples=samples, keep=False, shadow=shadows, between=between)
         return view.picture(environment, background=background, layers=layers, between=between)
 
@@ -566,19 +564,21 @@ class RelitScene(System):
         """
         batches.check(environments, cameras)
         require.number("memory", memory, 0.0, above=True)
-        if not isinstance(shadows, str):
-            raise TypeError(f'shadows must be "rays" or "vertices", got {require.shown(shadows)}')
         lights = batches.of_one_size(environments, self.light_size)
+        pictures.check(self, lights, shadows)
         options = {"samples": samples, "keep": False, "shadow": shadows, "between": None}
-        shown = {"background": background, "layers": layers, "memory": int(memory)}
         view_of = partial(self._picture_view, materials=materials, **options)
-        return batches.blocks(view_of, lights, cameras, **shown)
+        return batches.blocks(view_of, lights, cameras, memory=int(memory), background=background, layers=layers)
 
     @property
     def light_size(self) -> int | None:
         """Edge in texels of the faces of lights that the scene was precomputed for; None if it takes any."""
-        sizes = [surface.system.light_size for surface in self.surfaces]
-        return max((size for size in sizes if size is not None), default=None)
+        return max(surface.system.light_size or 0 for surface in self.surfaces) or None
+
+    @property
+    def light_step(self) -> int:
+        """See `System.light_step`."""
+        return 1 if self.bounces is None else self.bounces.tensor.light_step
 
     @promoted
     def picture_view(

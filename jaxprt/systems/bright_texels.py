@@ -116,6 +116,7 @@ class BrightTexels(VertexSystem):
 
     def light(self, environment: Environment) -> BrightLight:
         """Splits the light into its brightest texels and the rest, which the underlying system converts."""
+        environment = protocol.light_for(self, environment)
         texel, excess, rest = split(environment, count=self.count)
         return BrightLight(self.system.light(rest), texel, excess)
 

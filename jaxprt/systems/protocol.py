@@ -171,6 +171,11 @@ class System(eqx.Module):
         return getattr(self.growing, "size", None)
 
     @property
+    def light_step(self) -> int:
+        """Number that divides the edge of the faces of lights, because the system makes coarser faces of them."""
+        return 1
+
+    @property
     def texel_edge(self) -> int | None:
         """Edge of the cubemap faces whose brightest texels are summed exactly; None if none are."""
         return None
@@ -530,6 +535,24 @@ def one_light(value: Any, *, size: int | None = None, batch: bool = False) -> En
     return value if radiance is value.radiance else Environment(radiance)
 
 
+def light_for(taker: Any, value: Any, *, batch: bool = False) -> Environment:
+    """`one_light` of a size that a system, or a view, takes by its `light_size` and `light_step`.
+
+    What takes lights calls this before anything else: a view may take seconds, and a light that it does not fit none.
+
+    Raises:
+        TypeError: For the reasons of `one_light`.
+        ValueError: For the reasons of `one_light`, or the step does not divide the edge of the faces.
+    """
+    light = one_light(value, size=taker.light_size, batch=batch)
+    if light.radiance.shape[-3] % taker.light_step:
+        raise ValueError(
+            f"the light must have faces of a multiple of {taker.light_step} texels along an edge, as its reflections "
+            f"require, got {light.radiance.shape[-3]}"
+        )
+    return light
+
+
 def check_colors(light: int, view: int) -> None:
     """Refuses light and materials of different numbers of colors, unless one of them is gray, by ValueError."""
     if light != view and 1 not in (light, view):
@@ -573,12 +596,13 @@ def radiance(
         ValueError: A batch is empty, or a method of the system raises it.
     """
     _check(system)
+    if isinstance(environment, Environment):
+        environment = light_for(system, environment, batch=True)
     eye = require.position("the eye", origins.local("the eye", eye, system.origin))
     system = system.centered()
     view = system.view(eye, materials)
     if not isinstance(environment, Environment):
         return system.combine(system.shade(system.light(environment), materials), view)
-    environment = one_light(environment, batch=True)
     *batch, faces, rows, columns, colors = environment.radiance.shape
     if not batch:
         return system.combine(system.shade(system.light(environment), materials), view)

@@ -25,6 +25,7 @@ from jaxprt.relit.measuring import lights_of
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, load_environment, sides
 from jaxprt.scene.mesh import bounds
+from jaxprt.systems import protocol
 from jaxprt.view import messages, stages
 from jaxprt.view.content import light_texels, mip_edges, page_content, unshadowed_content
 from jaxprt.view.messages import Lamp, Look, Reply
@@ -138,7 +139,7 @@ class Session:
         Raises:
             TypeError: A system is not a relit scene, or a light is not an `Environment`.
             ValueError: There is no system or light, the scenes differ, the lights have different sizes, or one is a
-                batch.
+                batch or of a size that a system does not take.
         """
         if not isinstance(systems, RelitScene | Mapping):
             require.kind("the scene", systems, RelitScene, source="jaxprt.precompute")
@@ -183,6 +184,9 @@ class Session:
             old = self._version
             if environments is None and old is not None:
                 new.name, new.lights = old.stages.name, old.stages.lights
+            for system in new.systems.values():
+                for light in new.lights if isinstance(system, RelitScene) else ():
+                    protocol.light_for(system, light)
             self._version = _Version(1 if old is None else old.number + 1, new, preview)
 
     def prepare(self, make: Callable[[], None]) -> None:

@@ -16,7 +16,7 @@ import jaxprt as prt
 from jaxprt import bounces, lobe, visibility
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.image import rasterize
-from jaxprt.relit import Harmonics, Lobes, RelitScene, Terms, canvas, channels
+from jaxprt.relit import Harmonics, Lobes, RelitScene, Terms, canvas, channels, probes, shadows, tracing
 from jaxprt.relit.exact import exact_picture, exact_pixels
 from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.material import Texture
@@ -483,6 +483,38 @@ def test_lights_of_other_sizes_are_resampled_with_a_warning(close):
     with pytest.warns(UserWarning, match="1 of 2 lights have faces of 16 texels"):
         color = ready.pictures([fine, twice], [CAMERA], background=None)
     close(color[0], color[1], tolerance=1e-5)
+
+
+DOORS = {
+    "light": lambda ready, view, wrong: ready.light(wrong),
+    "radiance": lambda ready, view, wrong: ready.radiance(wrong, eye=CAMERA.eye),
+    "radiance of a system": lambda ready, view, wrong: prt.radiance(ready, wrong, eye=CAMERA.eye),
+    "batch": lambda ready, view, wrong: ready.radiance(Environment(np.asarray(wrong.radiance)[None]), eye=CAMERA.eye),
+    "picture": lambda ready, view, wrong: ready.picture(wrong, CAMERA),
+    "layers": lambda ready, view, wrong: ready.picture(wrong, CAMERA, layers=["depth"]),
+    "traced view": lambda ready, view, wrong: ready.picture_view(CAMERA, shadows=wrong),
+    "kept view": lambda ready, view, wrong: view.picture(wrong),
+    "mix": lambda ready, view, wrong: view.mix(wrong),
+    "report": lambda ready, view, wrong: ready.report([wrong]),
+    "probes": lambda ready, view, wrong: probes.sample(ready, wrong, np.zeros((1, 3))),
+}
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_lights_of_another_size_are_refused_before_rays_and_programs(door, monkeypatch):
+    ready = relit()
+    view = ready.picture_view(CAMERA)
+
+    def rays(*_, **__):
+        pytest.fail("rays before the light was refused")
+
+    for module in (shadows, tracing):
+        monkeypatch.setattr(module, "trace", rays)
+    wrong = Environment(np.ones((6, 16, 16, 3), np.float32))
+    words = r"must be one environment \[6, 8, 8, c\], got .*16, 16, 3\]: load it with"
+    with compiled() as events, pytest.raises(ValueError, match=words):
+        DOORS[door](ready, view, wrong)
+    assert not events
 
 
 @pytest.mark.parametrize(

@@ -274,6 +274,15 @@ def test_bounces_are_added_to_direct_light(reflecting):
     assert reflecting.nbytes > reflecting.without_bounces().nbytes
 
 
+def test_lights_must_have_faces_that_bounces_can_make_coarser(reflecting):
+    step = reflecting.light_step
+    assert step == reflecting.bounces.tensor.light_step > 1
+    odd = Environment(np.ones((6, step + 1, step + 1, 3), np.float32))
+    for call in (functools.partial(reflecting.radiance, eye=EYE), reflecting.light, reflecting.picture):
+        with pytest.raises(ValueError, match=f"a multiple of {step} texels along an edge, .*, got {step + 1}"):
+            call(odd)
+
+
 def test_lights_of_small_faces_have_bounces(monkeypatch):
     """Reflected light has as many texels as the light where that is small."""
     coarser = functools.partial(bounces.precompute.__wrapped__, size=8, components=8, modes=8)
@@ -590,6 +599,9 @@ def test_lights_eyes_and_cameras_of_another_kind_are_refused():
         ValueError, match=r"one environment \[6, 8, 8, c\], got \[6, 16, 16, 3\]: load it with .*size=8"
     ):
         ready.radiance(Environment(jnp.ones((6, 16, 16, 3))), eye=EYE)
+    assert relit("separable", rough=False).light_size == SIZE
+    with pytest.raises(ValueError, match=r"one environment \[6, 8, 8, c\], got \[6, 16, 16, 3\]"):
+        relit("separable", rough=False).picture(Environment(jnp.ones((6, 16, 16, 3))))
     with pytest.raises(ValueError, match=r"a picture needs one light \[6, n, n, c\], got \[2, 6, 8, 8, 3\]"):
         ready.picture(Environment(jnp.ones((2, 6, SIZE, SIZE, 3))))
     with pytest.raises(TypeError, match="the camera must be of class Camera"):

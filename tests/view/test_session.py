@@ -486,6 +486,8 @@ def test_scenes_and_lights_that_do_not_fit_are_refused(systems, lights):
         Session(systems, environments={})
     with pytest.raises(ValueError, match="lights must be of one size, got faces of 4, 8 texels"):
         Session(systems, environments=lights | {"small": Environment(np.ones((6, 4, 4, 3)))})
+    with pytest.raises(ValueError, match=r"the light must be one environment \[6, 8, 8, c\], got \[6, 16, 16, 3\]"):
+        Session(systems, environments={"fine": Environment(np.ones((6, 16, 16, 3)))})
     with pytest.raises(ValueError, match=r"the light 'two' must be one light"):
         Session(systems, environments={"two": Environment(np.ones((2, 6, 8, 8, 3)))})
 

@@ -94,6 +94,14 @@ class TransferTensor(eqx.Module):
         return 0 if self.lamp is None else self.lamp.shape[1]
 
     @property
+    def light_step(self) -> int:
+        """Number that divides the edge of the faces of lights: they are made coarser for each part of the tensor."""
+        texels = [self.mode.shape[1]]
+        texels += [] if self.second is None else [self.second.core.shape[1]]
+        texels += [] if self.patches is None else [self.patches.light.shape[1]]
+        return math.lcm(*(math.isqrt(count // 6) for count in texels))
+
+    @property
     def nbytes(self) -> int:
         """Bytes of the tensors."""
         held = self.weight, self.core, self.mode, self.second, self.patches, self.lamp

@@ -87,6 +87,11 @@ class SeparableSystem(protocol.VertexSystem):
         return combine(self.carried(light), view)
 
     @property
+    def light_size(self) -> int:
+        """Edge of the faces of the light, whose coefficients the transport has."""
+        return haar.face_edge(self.transport.rms.shape[0])
+
+    @property
     def vertices(self) -> int:
         """Number of vertices, or of points where radiance is evaluated at points."""
         return len(self.transport.position if self.points is None else self.points)
