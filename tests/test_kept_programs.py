@@ -664,3 +664,23 @@ def test_one_line_turns_it_off_for_loops(monkeypatch):
 def test_loops_that_read_values_of_other_kinds_are_not_kept(value):
     with pytest.raises(executables.UnnamedError):
         loops.describe(value)
+
+
+@pytest.mark.parametrize("granted", [2, 10**9])
+def test_programs_are_forgotten_before_memory_mappings_run_out(granted, monkeypatch, tmp_path):
+    if not executables._MAPS.exists():
+        pytest.skip("this system does not list memory mappings")
+    (tmp_path / "most").write_text(str(granted))
+    monkeypatch.setattr(executables, "_MOST", tmp_path / "most")
+    monkeypatch.setattr(executables, "_FEW", 1)
+    program = jax.jit(lambda x: 3 * x)
+    forgotten = []
+    monkeypatch.setattr(jax, "clear_caches", lambda: forgotten.append(program.clear_cache()))
+    assert program(2.0) == 6
+    jax.jit(lambda x: [executables.make_room(), x][1])(1.0)
+    assert not forgotten  # not while a program is being traced
+    executables.make_room()
+    assert program._cache_size() == (granted > 2)
+    executables.make_room()
+    assert len(forgotten) == (granted == 2)  # nothing new since
+    assert program(2.0) == 6

@@ -8,6 +8,7 @@ and static values and containers that this package, Equinox or Python define. Ev
 import contextlib
 import enum
 import functools
+import gc
 import hashlib
 import os
 import pathlib
@@ -38,6 +39,9 @@ _STARTED = time.time()
 _KNOWN = ("builtins", "jaxprt", "equinox", "numpy", "jax", "jaxlib", "collections")  # packages whose code has a version
 _CLEAN = re.compile(r"<jax\._src\.core\.AxisEnv object at 0x[0-9a-f]+>")  # empty where no trace is under way
 _functions: list["Kept"] = []
+_MAPS, _MOST = pathlib.Path("/proc/self/maps"), pathlib.Path("/proc/sys/vm/max_map_count")
+_FILLED = 0.7  # share of the memory mappings at which programs are forgotten
+_FEW = 32  # new programs after which mappings are counted again, which takes milliseconds
 
 
 class UnnamedError(Exception):
@@ -209,6 +213,43 @@ def forget() -> None:
     """Forgets the executables of this process, as `jax.clear_caches` forgets other programs."""
     for program in _functions:
         program.forget()
+
+
+class _Compiled:
+    """Counts the programs that this process compiles or loads.
+
+    Attributes:
+        programs: Their number.
+        counted: Their number when mappings were counted last.
+    """
+
+    def __init__(self) -> None:
+        self.programs = self.counted = 0
+        jax.monitoring.register_event_duration_secs_listener(self._add)
+
+    def _add(self, event: str, _: float, **__: Any) -> None:
+        self.programs += event == "/jax/core/compile/backend_compile_duration"
+
+
+_compiled = _Compiled()
+
+
+def make_room() -> None:
+    """Forgets the programs of this process, JAX's too, when they fill most of the memory mappings that Linux grants it.
+
+    These are 65,530, and each program takes several. A process that draws pictures of hundreds of sizes, or scenes one
+    after another, would be ended by the compiler.
+    """
+    programs = _compiled.programs + count()
+    if programs - _compiled.counted < _FEW or not core.trace_state_clean():
+        return
+    _compiled.counted = programs
+    with contextlib.suppress(OSError, ValueError):  # not on Linux
+        if _MAPS.read_bytes().count(b"\n") > _FILLED * int(_MOST.read_text()):
+            forget()
+            jax.clear_caches()
+            gc.collect()
+            _compiled.counted = _compiled.programs
 
 
 def _concrete(leaves: Sequence[Any]) -> bool:

@@ -18,6 +18,7 @@ from jaxprt.compile import Between, compile_time, finished, jit, known, promoted
 from jaxprt.files import outputs
 from jaxprt.image import raster
 from jaxprt.image.pixels import Pixels, visible_points
+from jaxprt.programs.executables import make_room
 from jaxprt.relit import canvas, curvature, groups, lamplight, shadows, tracing
 from jaxprt.relit.casting import caster
 from jaxprt.relit.channels import Appearance
@@ -495,6 +496,7 @@ def make(
     elif shadow not in ("rays", "vertices"):
         raise ValueError(f'shadows must be "rays", "vertices" or an Environment, got {require.shown(shadow)}')
     samples, camera, fold = drawn(camera, samples)
+    make_room()
     with compile_time(stage.mesh, camera, stage.bend) if stage.sharp_groups else contextlib.nullcontext():
         pixels, rows = _placed(stage, camera, samples, between)
     rays = isinstance(shadow, Environment) or shadow == "rays"
