@@ -463,7 +463,8 @@ def exact_at(part: Part, shading: Shading, points: Points) -> tuple[Callable, Ar
     if not isinstance(part.material, TexturedMaterial):
         return shading.exact, None, points
     look = material_table.of_parts([part]).at(points)
-    return PerVertex(_model(part.name, look, shading)), look.emitted, points.tilted(look.normal)
+    brdf = Lambert(look.coefficient[:, _BARE[0]]) if shading.matte else _model(part.name, look, shading)
+    return PerVertex(brdf), look.emitted, points.tilted(look.normal)
 
 
 def _fits(name: str, shading: Shading, look: MaterialLook) -> Any:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, UInt8
 from jaxprt import require, visibility
 from jaxprt.brdf import grid
 from jaxprt.brdf.varying import PerVertex
-from jaxprt.compile import Between, finished, jit, mapped
+from jaxprt.compile import Between, finished, jit, known, mapped
 from jaxprt.scene import origin as origins
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh, relative
@@ -54,7 +54,9 @@ def radiance(
         error: Largest relative error of the radiance of each vertex, averaged over colors, due to integration of BRDF x
             cosine. It is an estimate: a peak of the BRDF that is narrower than a texel is detected around the mirror
             direction only. Light is constant over each texel, and visibility is a share of the texel in sixteenths;
-            their errors are not included. With infinity, each texel uses the BRDF at its center.
+            their errors are not included. With infinity, each texel uses the BRDF at its center. If the BRDF is
+            Lambertian, one ray decides about each texel whose share of the unshadowed radiance is below a quarter of
+            the error.
         progress: Whether to show a progress bar.
         between: Function called after each block of 64 vertices. An exception that it raises stops the computation.
 
@@ -102,9 +104,14 @@ def radiance(
     if not vertex.size:
         return jnp.zeros((*light.radiance.shape[:-4], 0, light.radiance.shape[-1]))
     result = []
+    matte = (
+        getattr(brdf.model if isinstance(brdf, PerVertex) else brdf, "matte", False) and known(light) and error < np.inf
+    )
     for first in tqdm.trange(0, len(vertex), _BLOCK, desc="reference", disable=not progress):
         part = np.resize(vertex[first : first + _BLOCK], _BLOCK)
-        seen, _ = visibility.fractional(rays, start[part], np.asarray(above[part], np.float32), size=size)
+        fine = _shares(light, frame[part, 2]) > error / 4 if matte else True
+        options = {"size": size, "supersample": fine}
+        seen, _ = visibility.fractional(rays, start[part], np.asarray(above[part], np.float32), **options)
         model = PerVertex(brdf.of(jnp.asarray(part))) if isinstance(brdf, PerVertex) else brdf
         block = finished(integrate(seen, position[part], frame[part], model, light, eye, error=error), between)
         result.append(block[..., : len(vertex) - first, :])
@@ -115,6 +122,15 @@ def _smooth(mesh: Mesh, points: Points) -> Float[np.ndarray, "p 3"]:
     """Interpolated normals of points, without normal maps."""
     frame = directions.frame(mesh.normal, mesh.tangent)
     return np.asarray(points.tilted(None).frame(frame))[:, 2]
+
+
+def _shares(light: Environment, normal: Float[np.ndarray, "b 3"]) -> Float[np.ndarray, "b d"]:
+    """Share of each texel in the irradiance of surfaces without shadows: the largest one under several lights."""
+    area = np.asarray(cubemap.vector_area(size=light.radiance.shape[-2])).reshape(-1, 3)
+    flux, share = np.maximum(normal @ area.T, 0), np.float32(0)
+    for radiance in np.abs(np.asarray(light.radiance).mean(-1)).reshape(-1, len(area)):
+        share = np.maximum(share, radiance / np.maximum(flux @ radiance, _DARK)[:, None])
+    return flux * share
 
 
 @jit

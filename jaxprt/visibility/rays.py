@@ -97,7 +97,7 @@ def fractional(
     normal: Float32[np.ndarray, "v 3"],
     *,
     size: int,
-    supersample: bool = True,
+    supersample: bool | Bool[np.ndarray, "v d"] = True,
 ) -> tuple[UInt8[np.ndarray, "v d"], RayCount]:
     """Visible fraction of each cubemap texel from each point, in sixteenths; 0 below the horizon.
 
@@ -111,7 +111,7 @@ def fractional(
         start: Origins of the rays, from `start_points`.
         normal: Unit normals.
         size: Edge of the cubemap's faces in texels.
-        supersample: Whether texels on a visibility boundary are supersampled.
+        supersample: Whether texels on a visibility boundary are supersampled: all, none, or some for each point.
 
     Returns:
         Visibility times 16 of the 6 size^2 texels, and the number of rays.
@@ -125,7 +125,8 @@ def fractional(
     count = RayCount(0, 0, 0)
     for first in range(0, len(start), step):
         part = slice(first, first + step)
-        count += _trace(occluder, start[part], above[part], seen[part], table, supersample)
+        fine = supersample if isinstance(supersample, bool) else supersample[part]
+        count += _trace(occluder, start[part], above[part], seen[part], table, fine)
     return seen, count
 
 
@@ -297,7 +298,12 @@ def _tables(size: int) -> _Tables:
 
 
 def _trace(
-    occluder: Occluder, start: np.ndarray, above: np.ndarray, seen: np.ndarray, table: _Tables, supersample: bool
+    occluder: Occluder,
+    start: np.ndarray,
+    above: np.ndarray,
+    seen: np.ndarray,
+    table: _Tables,
+    supersample: bool | np.ndarray,
 ) -> RayCount:
     """Fills `seen` for some of the points."""
     vertex, rank = np.nonzero(above.take(table.order, axis=1))
@@ -311,7 +317,9 @@ def _trace(
     else:
         flat[place] = ~occluder.blocked(start, table.center, vertex, texel)
         boundary = _boundary
-    mixed = np.flatnonzero(boundary(seen, table.border).reshape(-1)[place]) if supersample else place[:0]
+    mixed = place[:0]
+    if supersample is not False:
+        mixed = np.flatnonzero((boundary(seen, table.border).reshape(seen.shape) & supersample).reshape(-1)[place])
     if not occluder.blends:
         flat[place] *= LEVELS
     flat[place[mixed]] = _supersample(occluder, start, vertex[mixed], texel[mixed], table)

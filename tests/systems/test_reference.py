@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import jaxprt as prt
-from jaxprt import reference
+from jaxprt import reference, visibility
 from jaxprt.brdf import AshikhminShirley, Lambert
+from jaxprt.brdf.varying import PerVertex
 from jaxprt.scene import Environment
 from jaxprt.scene.environment import rotate
 from jaxprt.sphere import cubemap, directions
@@ -168,6 +169,26 @@ def test_blocked_vertices_are_black_and_shadows_only_darken(mesh, random):
     assert (shadowed < 0.9 * free).any()
 
 
+@pytest.mark.parametrize("brdf", [Lambert(0.5), PerVertex(Lambert(np.full((122, 1), 0.5, np.float32)))], ids=type)
+def test_texels_that_matter_less_than_the_error_have_one_ray_where_the_surface_is_matte(
+    mesh, random, monkeypatch, brdf
+):
+    light, counts = some_light(random), []
+
+    def traced(*argument, **options):
+        seen, count = fractional(*argument, **options)
+        counts.append(count.supersampled)
+        return seen, count
+
+    fractional = visibility.fractional
+    monkeypatch.setattr(visibility, "fractional", traced)
+    fine, coarse, none = (reference.radiance(mesh, brdf, light, eye=EYE, error=error) for error in (1e-3, 0.04, 10.0))
+    fine_count, coarse_count, no_count = np.reshape(counts, (3, -1)).sum(1)
+    assert no_count == 0 < coarse_count < 0.8 * fine_count
+    assert 0 < np.linalg.norm(coarse - fine) < 0.02 * np.linalg.norm(fine)
+    assert np.linalg.norm(coarse - fine) < np.linalg.norm(none - fine)
+
+
 @pytest.mark.parametrize("brdf", [Lambert(0.5), GLOSSY], ids=["lambert", "glossy"])
 def test_a_quarter_turn_of_everything_changes_nothing(mesh, brdf, random, close):
     light = some_light(random)
@@ -184,9 +205,10 @@ def test_a_quarter_turn_of_everything_changes_nothing(mesh, brdf, random, close)
 
 def test_any_function_of_two_directions_is_a_brdf(mesh, random, close):
     light, model = some_light(random), Lambert([0.2, 0.5, 0.9])
-    expected = reference.radiance(mesh, model, light, eye=EYE)
-    close(reference.radiance(mesh, lambda wi, wo: model(wi, wo), light, eye=EYE), expected)
-    close(reference.radiance(mesh, model.__call__, light, eye=EYE), expected)
+    options = {"eye": EYE, "error": CENTERS}  # as many rays for functions as for a matte model
+    expected = reference.radiance(mesh, model, light, **options)
+    close(reference.radiance(mesh, lambda wi, wo: model(wi, wo), light, **options), expected)
+    close(reference.radiance(mesh, model.__call__, light, **options), expected)
 
 
 @pytest.mark.parametrize("value", [lambda wi, wo: wi[..., 2], lambda wi, wo: 0.3, lambda wi, wo: jnp.ones(3)])
