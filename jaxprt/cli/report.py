@@ -5,7 +5,7 @@ import itertools
 import math
 import statistics
 import timeit
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from jaxprt.files import objects
 from jaxprt.image import pixels
 from jaxprt.relit import measuring
 from jaxprt.relit.channels import Shading, of_part
-from jaxprt.relit.exact import ExactPicture, ExactPixels, exact_picture, exact_pixels
+from jaxprt.relit.exact import ExactPicture, ExactPixels, exact_picture, exact_pixels, importance
 from jaxprt.relit.exact_lamps import Lamps
 from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.recipes import Known, Recipe, Target, harmonic_table
@@ -39,7 +39,7 @@ TABLE_LAPLACIAN = (1.0, 0.4)
 TABLE_LOBES = (4, 12, 24)
 TABLE_TEXELS = (0, 16, 64)
 PIXELS = 1000  # pixels at which pictures are measured
-POINTS = 1 << 14  # largest number of points of the exact picture: half a minute on two cores
+POINTS = 26_000  # largest number of points of the exact picture: half a minute on two cores
 VERTICES = 300  # vertices of each part at which radiance is measured
 _AMPLIFY = 4.0  # brightness of the difference picture relative to the others
 _KEPT = 1 << 20  # pixels of the largest picture whose view is cached, about a gigabyte
@@ -169,7 +169,7 @@ def exact(view: View, drawn: dict[str, list[Array]]) -> Truth:
     """Exact pixels, pictures and vertices of a view. Pixels are sampled mostly where drawn pictures may be wrong."""
     shadings, lights = [of_part(part) for part in view.scene.parts], list(view.lights.values())
     seconds, start = {}, timeit.default_timer()
-    options = {"pixels": PIXELS, "importance": _importance(itertools.chain(*drawn.values())), "progress": True}
+    options = {"pixels": PIXELS, "importance": importance(itertools.chain(*drawn.values())), "progress": True}
     pixels = exact_pixels(view.scene, shadings, lights, view.camera, **options)
     seconds["pixels"], start = timeit.default_timer() - start, timeit.default_timer()
     picture = exact_picture(view.scene, shadings, lights, view.camera, most=POINTS, progress=True)
@@ -179,16 +179,6 @@ def exact(view: View, drawn: dict[str, list[Array]]) -> Truth:
     radiance = exact_vertices(view, vertex)
     seconds["vertices"] = timeit.default_timer() - start
     return Truth(pixels, picture, vertex, radiance, seconds)
-
-
-def _importance(drawn: Iterable[Array]) -> np.ndarray:
-    """Sampling density of pixels: larger where pictures are bright, and larger still where they vary."""
-    total: Any = 0
-    for picture in drawn:
-        gray = np.asarray(picture, np.float64).mean(-1)
-        around = np.stack([np.roll(gray, step, (0, 1)) for step in itertools.product((-1, 0, 1), repeat=2)])
-        total = total + (around.var(0) + 0.01 * gray**2) / max(np.mean(gray**2), 1e-30)
-    return np.sqrt(total) + 0.02
 
 
 def exact_vertices(view: View, vertices: list[np.ndarray]) -> list[np.ndarray]:
@@ -256,6 +246,7 @@ def compare(
     for number, (name, truth_picture) in enumerate(right.items()):
         result[name]["exposure_stops"] = float(stops[name])
         result[name]["exact_pixels_error"] = float(truth.pixels.error[number])
+        result[name]["exact_picture_error"] = float(truth.picture.error[number])
         _write(output, f"{name}_reference", truth_picture, stops[name], tone=view.tone)
         row = jnp.concatenate([*rows[name], _enlarge(truth_picture, view.camera)], 1)
         files.write_png(output / f"{name}.png", np.asarray(image.display(row, tone=view.tone, stops=stops[name])))

@@ -4,8 +4,9 @@ The light of the environment is the sum over all its texels, that of lamps the s
 """
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -21,7 +22,7 @@ from jaxprt.compile import Between, finished
 from jaxprt.image import Pixels, front, raster, relative_l2, resolve
 from jaxprt.image.pixels import nearest_fragments, pixel_angle, sky, visible_points
 from jaxprt.relit import exact_lamps
-from jaxprt.relit.channels import Shading, at_points, exact_at
+from jaxprt.relit.channels import Shading, exact_at
 from jaxprt.scene import Camera, Environment, Mesh, Scene, environment, sides
 from jaxprt.scene.points import Points, on_triangles
 from jaxprt.scene.scene import centered
@@ -29,7 +30,8 @@ from jaxprt.systems import reference
 from jaxprt.visibility import Occluder, blocks
 
 _SIDE = 4  # number of coverage places along the edge of a pixel
-_COARSE = 64  # largest number of points for each vertex at which radiance is interpolated between vertices
+_PER_PIXEL = 64  # points of a picture for each pixel at which its error is estimated
+_FEWEST = 64  # such pixels
 
 
 class ExactPixels(NamedTuple):
@@ -71,12 +73,18 @@ class ExactPicture(NamedTuple):
         color: Linear radiance of the picture under each light.
         surface: Linear radiance of the surfaces alone: the picture in front of black.
         alpha: Fraction of each pixel that shows surfaces.
+        error: Estimated relative L2 error of `color` under each light, over the pixels that show surfaces. It is the
+            difference from `exact_pixels` at some of them, which have other points: 16 places of coverage and up to 4
+            points for each part, in place of 4 places and one point for each surface. It contains edges of surfaces and
+            of shadows within a pixel and the noise of lamps, and the error of those pixels too, so that it is
+            rather too large than too small. It does not contain that light is constant over each texel.
     """
 
     camera: Camera
     color: Float[np.ndarray, "l h w c"]
     surface: Float[np.ndarray, "l h w c"]
     alpha: Float[np.ndarray, "h w"]
+    error: Float[np.ndarray, " l"]
 
 
 def exact_pixels(
@@ -164,16 +172,16 @@ def exact_picture(
 ) -> ExactPicture:
     """Computes a whole reference picture: the exact sum over all texels, with rays traced from each shading point.
 
-    Lambertian parts are summed at their vertices and interpolated, as in the pictures of systems. This is not done if
-    they have more vertices than points, or more than 64 points for each vertex. If the other parts have more than
-    `most` points, the width and height of the picture are divided by 2, 3 or more.
+    Every surface that a pixel shows has one point, at the mean of those of 4 samples that see it. If there are more
+    than `most` points, the width and height of the picture are divided by 2, 3 or more.
 
     Args:
         scene: The scene.
         shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
         environments: Environments of one size.
         camera: The camera.
-        most: Largest number of points of parts that are not Lambertian, at least 1.
+        most: Largest number of points, at least 1. A Lambertian one counts as a half, because it takes less than half
+            of the time, which is nearly all for rays. The estimate of the error has about a sixteenth as many more.
         progress: Whether to show progress bars.
         between: Function that is called between steps of the work, as in `exact_pixels`.
 
@@ -182,38 +190,29 @@ def exact_picture(
     """
     if most < 1:
         raise ValueError(f"most must be at least 1 point, got {most}")
-    asked, (scene, camera) = camera, _near(scene, camera)
+    whole, asked = scene, camera
+    scene, camera = _near(scene, camera)
     shown = finished(_PicturePoints.of(scene, camera), between)
-    tilted = [getattr(part.material, "normal_texture", None) is not None for part in scene.parts]
-    lamps = exact_lamps.Lamps.of(scene, shadings)
-    interpolated = [not lamps.lamp and not normal_map for normal_map in tilted]
-    smooth = [_is_smooth(shading, shown, part) and interpolated[part] for part, shading in enumerate(shadings)]
-    count = np.count_nonzero(np.isin(shown.owner, np.flatnonzero(np.logical_not(smooth))))
-    if count > most:
+    cost = np.array([0.5 if shading.matte else 1.0 for shading in shadings] + [0.0])  # the last one of padding
+    if (count := cost[shown.owner].sum()) > most:
         step = math.ceil(math.sqrt(count / most))
         size = {"width": max(camera.width // step, 1), "height": max(camera.height // step, 1)}
-        camera = dataclasses.replace(camera, **size)
+        camera, asked = (dataclasses.replace(view, **size) for view in (camera, asked))
         shown = _PicturePoints.of(scene, camera)
-    lights = Environment(jnp.stack([light.radiance for light in environments]))
+    lights, lamps = (
+        Environment(jnp.stack([light.radiance for light in environments])),
+        exact_lamps.Lamps.of(scene, shadings),
+    )
     # Surfaces and lamps may have colors where the light is gray.
     color, colors = np.zeros((len(environments), len(shown.owner), 3), np.float32), lights.radiance.shape[-1]
-    options = {"eye": camera.eye, "occluder": scene.mesh, "progress": progress, "between": between}
+    options = {"progress": progress, "between": between}
     for number, (part, shading) in enumerate(zip(scene.parts, shadings, strict=True)):
         index = np.flatnonzero(shown.owner == number)
         if not len(index):
             continue
-        points = shown.points(index, number)
-        if smooth[number]:
-            vertex = np.unique(points.corner)
-            at_vertices = np.zeros((len(color), len(part.mesh.position), 3), color.dtype)
-            at_vertices[:, vertex] = _sum(shading.mesh, shading.brdf, lights, vertex, **options)
-            look = at_points(part, shading, None, points)
-            value, emitted = points.carry(jnp.asarray(at_vertices), axis=1), look.emitted
-            value = value if look.blend is None else value * look.blend.weight[:, 0]
-        else:
-            brdf, emitted, points = exact_at(part, shading, points)
-            value = _sum(shading.mesh, brdf, lights, points, **options)
-            value = value + lamps.at_points(shading.mesh, brdf, points, jnp.asarray(camera.eye))
+        brdf, emitted, points = exact_at(part, shading, shown.points(index, number))
+        value = _sum(shading.mesh, brdf, lights, points, eye=camera.eye, occluder=scene.mesh, **options)
+        value = value + lamps.at_points(shading.mesh, brdf, points, jnp.asarray(camera.eye))
         value = value if emitted is None else value + emitted
         color[:, index], colors = value, max(colors, value.shape[-1])
     color = color[..., :colors]
@@ -221,9 +220,20 @@ def exact_picture(
     pictures = [resolve(shown.pixels, a, background=b) for a, b in zip(color, behind, strict=True)]
     surfaces, empty = [resolve(shown.pixels, light) for light in color], np.asarray(shown.pixels.background)
     alpha = 1 - (empty if empty.ndim == 2 else empty.mean(-1))
-    if (camera.width, camera.height) != (asked.width, asked.height):
-        asked = dataclasses.replace(asked, width=camera.width, height=camera.height)
-    return ExactPicture(asked, np.stack(pictures), np.stack(surfaces), alpha)
+    few = max(_FEWEST, np.count_nonzero(shown.owner >= 0) // _PER_PIXEL)
+    others = exact_pixels(whole, shadings, environments, asked, pixels=few, importance=importance(pictures), **options)
+    error = [others.relative_l2(picture, light=light)[0] for light, picture in enumerate(pictures)]
+    return ExactPicture(asked, np.stack(pictures), np.stack(surfaces), alpha, np.array(error))
+
+
+def importance(pictures: Iterable[ArrayLike]) -> Float[np.ndarray, "h w"]:
+    """Sampling density of pixels: larger where pictures are bright, and larger still where they vary."""
+    total: Any = 0
+    for picture in pictures:
+        gray = np.asarray(picture, np.float64).mean(-1)
+        around = np.stack([np.roll(gray, step, (0, 1)) for step in itertools.product((-1, 0, 1), repeat=2)])
+        total = total + (around.var(0) + 0.01 * gray**2) / max(np.mean(gray**2), 1e-30)
+    return np.sqrt(total) + 0.02
 
 
 def _hidden_faces(scene: Scene, mesh: Mesh) -> Bool[np.ndarray, " f"]:
@@ -237,26 +247,17 @@ def _near(scene: Scene, camera: Camera) -> tuple[Scene, Camera]:
 
 
 def _sum(
-    mesh: Mesh,
-    brdf: Callable,
-    lights: Environment,
-    place: Points | Int[np.ndarray, " n"],
-    *,
-    progress: bool,
-    **options: Any,
+    mesh: Mesh, brdf: Callable, lights: Environment, points: Points, *, progress: bool, **options: Any
 ) -> np.ndarray:
-    """`reference.radiance` at points, or at the vertices of some indices, on all cores."""
+    """`reference.radiance` at points, on all cores."""
 
     def radiance(number: int, index: np.ndarray) -> np.ndarray:
-        model, where = brdf, dict(options, progress=progress and number == 0)
-        if isinstance(place, Points):
-            where["points"] = jax.tree.map(lambda column: jnp.asarray(np.asarray(column)[..., index]), place)
-            model = PerVertex(brdf.of(jnp.asarray(index))) if isinstance(brdf, PerVertex) else brdf
-        else:
-            where["vertex"] = place[index]
-        return np.asarray(reference.radiance(mesh, model, lights, **where))
+        some = jax.tree.map(lambda column: jnp.asarray(np.asarray(column)[..., index]), points)
+        model = PerVertex(brdf.of(jnp.asarray(index))) if isinstance(brdf, PerVertex) else brdf
+        shown = progress and number == 0
+        return np.asarray(reference.radiance(mesh, model, lights, points=some, progress=shown, **options))
 
-    count = len(place)
+    count = len(points)
     parts = np.array_split(np.arange(count), min(blocks.cores(), max(count // 64, 1)))
     # The threads of NumPy's matrix products would busy-wait.
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(len(parts)) as pool:
@@ -292,13 +293,6 @@ class _PicturePoints(NamedTuple):
         corner = self.face[np.asarray(self.pixels.triangle)[index]] - self.first[part]
         weight, slope = (np.asarray(column)[index] for column in (self.pixels.barycentric, self.pixels.slope))
         return Points(*map(jnp.asarray, (corner.T, weight.T, np.moveaxis(slope, 0, -1))))
-
-
-def _is_smooth(shading: Shading, shown: _PicturePoints, part: int) -> bool:
-    """Whether to sum the radiance of a part at its vertices: it is Lambertian, and its vertices are dense enough."""
-    index = np.flatnonzero(shown.owner == part)
-    vertices = len(np.unique(shown.face[np.asarray(shown.pixels.triangle)[index]]))
-    return shading.matte and vertices <= len(index) <= _COARSE * vertices
 
 
 def _choose_places(covered: np.ndarray, count: int) -> np.ndarray:

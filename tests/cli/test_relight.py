@@ -150,6 +150,7 @@ def test_the_report_is_json_of_finite_numbers(output):
             assert 0 < light[system]["picture_error_spread"] < 0.3 * light[system]["picture_error"]
             assert set(light[system]["vertex_error"]) == {"mesh", "ground"}
         assert 0 < light["exact_pixels_error"] < 0.2
+        assert 0 < light["exact_picture_error"] < 0.3
     assert 100 < told["exact"]["pixels"] < 300
     assert told["exact"]["picture_width"] == 32
     assert told["exact"]["vertices"] == {"mesh": 4, "ground": 39}
@@ -206,7 +207,7 @@ def glossy(place):
     with pytest.MonkeyPatch.context() as patch:
         for name, values in (("TERMS", (1, 4)), ("KEEP", (32, 96)), ("DEGREES", (1, 3)), ("LOBES", (1,))):
             patch.setattr(cli_report, f"TABLE_{name}", values)
-        patch.setattr(cli_report, "POINTS", 80)
+        patch.setattr(cli_report, "POINTS", 90)
         assert run(place, *options, sky=("sky.exr", "glossy/other/sky.exr"), output=folder) == 0
     return folder
 
