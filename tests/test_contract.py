@@ -810,6 +810,7 @@ EXAMPLES = {
         )
     ),
     "systems.harmonic.system.project": example(lambda draw: call(draw.light()), degree=2),
+    "systems.harmonic.system.tilted_share": example(lambda draw: call(draw.uniform(5), draw.uniform(5))),
     "benchmarks.published.harmonics.unshadowed_radiance": example(
         lambda draw: call(draw.mesh(), draw.harmonic(), draw.normal(4, 3), eye=draw.camera().eye),
         gradient=("brdf", "light", "eye"),

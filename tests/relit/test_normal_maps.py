@@ -9,7 +9,7 @@ import pytest
 
 import jaxprt as prt
 from jaxprt import lobe
-from jaxprt.relit import Lobes, RelitScene, canvas
+from jaxprt.relit import Harmonics, Lobes, RelitScene, canvas
 from jaxprt.relit.exact import exact_pixels
 from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial
 from jaxprt.scene.material import Texture
@@ -81,6 +81,17 @@ def test_matte_surfaces_reflect_by_the_normal_of_the_map(hand):
     np.testing.assert_allclose(vertices, np.broadcast_to(expected, (4, 3)), rtol=MATTE_ERROR)
     kept = ready.picture_view(CAMERA, samples=1).picture(light())
     np.testing.assert_allclose(kept.reshape(-1, 3), picture, rtol=1e-5)
+
+
+@pytest.mark.parametrize("hand", [1.0, -1.0])
+def test_matte_harmonics_reflect_linear_light_by_the_normal_of_the_map(hand):
+    scene = square(hand, normal_texture=tilted(), **MATTE)
+    ready = prt.precompute(scene, system=Harmonics(degree=2), size=SIZE, progress=False)
+    linear = Environment(1 + cubemap.direction(size=SIZE))
+    expected = 0.8 * (1 + 2 / 3 * np.array([TILT[0], TILT[2], -hand * TILT[1]]) / np.linalg.norm(TILT))
+    picture = np.asarray(ready.picture(linear, CAMERA, samples=1)).reshape(-1, 3)
+    np.testing.assert_allclose(picture, np.broadcast_to(expected, picture.shape), rtol=0.01)
+    np.testing.assert_allclose(ready.radiance(linear, eye=CAMERA.eye), np.broadcast_to(expected, (4, 3)), rtol=0.01)
 
 
 def test_lobes_are_turned_by_the_map_as_exact_pixels_are():

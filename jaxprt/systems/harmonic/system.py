@@ -28,6 +28,8 @@ from jaxprt.systems.harmonic.table import HarmonicBrdf
 from jaxprt.systems.harmonic.transfer import TransferMatrix, TransferVector, right_handed
 from jaxprt.systems.protocol import Blend
 
+_DARK, _BRIGHTEST = 1e-6, 4.0  # least light that tilted normals are compared with, and largest ratio to it
+
 
 def _light_shape(value: Any) -> None:
     require.array("the light", value, "lm c", "lm c v", source="jaxprt.harmonic.project")
@@ -131,6 +133,18 @@ class HarmonicSystem(protocol.VertexSystem):
         return len(self.transport.position if self.points is None else self.points)
 
 
+class TiltedLight(eqx.Module):
+    """Light for ideal diffuse surfaces whose normals are tilted by normal maps.
+
+    Attributes:
+        coefficient: SH coefficients of the light in the world.
+        normal: Unit normals of the vertices.
+    """
+
+    coefficient: Float[Array, "lm c *w"]
+    normal: Float[Array, "v 3"]
+
+
 class DiffuseSystem(protocol.VertexSystem):
     """Transfer vectors for ideal diffuse surfaces, whose radiance is the same for all views.
 
@@ -159,12 +173,25 @@ class DiffuseSystem(protocol.VertexSystem):
         """Albedo of all vertices, or of each vertex with a blend. It does not depend on the eye."""
         return protocol.albedo_view(self.albedo, eye, materials, vertices=self.vertices)
 
+    def tilted(self, light: Float[Array, "lm c *w"], normal: Float[Array, "v 3"]) -> TiltedLight:
+        """The light with the normals of the vertices: `System.tilted`."""
+        return TiltedLight(light, normal)
+
     @promoted
-    def combine(self, light: Float[Array, "lm c *w"], view: Float[Array, "_ d"]) -> Float[Array, "v e"]:
-        """Radiance: the dot product of light and transfer vectors, times the albedo."""
-        require.array("the light", light, "lm c", "lm c v", source="DiffuseSystem.light")
+    def combine(self, light: Float[Array, "lm c *w"] | TiltedLight, view: Float[Array, "_ d"]) -> Float[Array, "v e"]:
+        """Radiance: the dot product of light and transfer vectors, times the albedo.
+
+        At points with tilted normals it changes by the ratio by which it would change without shadows.
+        """
+        coefficient = light.coefficient if isinstance(light, TiltedLight) else light
+        require.array("the light", coefficient, "lm c", "lm c v", source="DiffuseSystem.light")
         require.array("the view", view, "v c", source="DiffuseSystem.view")
-        return self.carried(combine(light, self.transport.vector)) * view
+        color = self.carried(combine(coefficient, self.transport.vector)) * view
+        if not isinstance(light, TiltedLight) or self.points is None or self.points.normal is None:
+            return color
+        smooth = directions.normalize(self.points.carry(light.normal))
+        there = coefficient if coefficient.ndim == 2 else self.carried(coefficient, axis=2)
+        return color * tilted_share(*(_unshadowed(there, normal) for normal in (smooth, self.points.normal.T)))
 
     def exported(self, what: str) -> protocol.Exported:
         """The transfer vectors: `System.exported`."""
@@ -187,6 +214,20 @@ class DiffuseSystem(protocol.VertexSystem):
     def shared_light(self) -> tuple:
         """Key of the light, which depends on the environment and the number of coefficients only."""
         return DiffuseSystem, self.transport.vector.shape[0]
+
+
+def tilted_share(before: Float[Array, "*b"], after: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """Ratio of the unshadowed light on tilted normals to that on the normals of the surface, at most 4."""
+    return jnp.clip(after / jnp.maximum(before, _DARK), 0, _BRIGHTEST)
+
+
+@jit
+def _unshadowed(light: Float[Array, "lm c *w"], normal: Float[Array, "p 3"]) -> Float[Array, "p c"]:
+    """Irradiance / pi of normals without shadows."""
+    degree = harmonics.degree_of(len(light))
+    response = harmonics.convolve(light, harmonics.cosine(degree=degree) / jnp.pi)
+    basis = harmonics.evaluate(normal, degree=degree)
+    return combine(response, jnp.moveaxis(basis, 1, 0)[:, None])
 
 
 def _coefficients(light: Any, degree: int) -> Float[Array, "lm c *w"]:

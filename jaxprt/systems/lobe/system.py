@@ -35,7 +35,6 @@ _LEAST = 1e-3  # smallest visibility by which the shift of a lobe is divided
 _FARTHEST = 2.5  # largest shift of the mean of the visible part, in standard deviations
 _TINY = 1e-12
 _FLANK = 0.55  # spread of a lobe whose flanks, at 50 degrees, are as steep as those of a cosine
-_DARK, _BRIGHTEST = 1e-6, 4.0  # least light that tilted normals are compared with, and largest ratio to it
 
 
 class LobeView(eqx.Module):
@@ -183,8 +182,8 @@ class CoarseLobes(LobeSystem):
             return super().combine(light, view)
         smooth = view.points.tilted(None).frame(self.transport.frame)[:, 2]
         before, after = (_upon(light, normal) for normal in (smooth.T, view.points.normal))
-        share = jnp.minimum(after / jnp.maximum(before, _DARK), _BRIGHTEST)
-        return super().combine(light, dataclasses.replace(view, diffuse=view.diffuse * share))
+        diffuse = view.diffuse * harmonic.system.tilted_share(before, after)
+        return super().combine(light, dataclasses.replace(view, diffuse=diffuse))
 
 
 def _brdf(value: Any) -> None:
