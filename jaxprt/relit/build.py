@@ -144,7 +144,7 @@ def precompute(
             preview(coarse)
     near = centered(scene)
     shadings = shaded(near.parts, recipes)
-    _warn(scene, near, shadings)
+    _warn(scene, near, shadings, recipes)
     traced = _Traced.of(scene, near, shadings, recipes, size, run)
     direct = traced.relit(**fields)
     if not bounces:
@@ -166,9 +166,10 @@ def _as_shaded(scene: Scene, shadings: Sequence[Shading]) -> Scene:
     return dataclasses.replace(scene, parts=list(map(channels.as_shaded, scene.parts, shadings)))
 
 
-def _warn(scene: Scene, near: Scene, shadings: Sequence[Shading]) -> None:
+def _warn(scene: Scene, near: Scene, shadings: Sequence[Shading], recipes: Sequence[Recipe]) -> None:
     """Warns of scenes that look wrong although they are drawn as asked, before rays are traced."""
     warn.of_gain(near, shadings)
+    warn.of_omissions(near.parts, shadings, recipes)
     warn.of_shells(near)
     scene = _as_shaded(scene, shadings)
     warn.of_backs(scene, scene.mesh, default_camera(scene, scene.mesh))

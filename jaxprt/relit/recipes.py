@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -25,6 +25,7 @@ _STEPS = 4  # number of intervals of a harmonic table for each interval of a lob
 _VARYING = 0.02  # error of harmonic tables over roughness
 _MATTE_TEXELS = 32  # factor on the number of single texels of Lambertian parts
 _PAIRS = 256  # pairs of directions at which BRDFs are tried
+_HALF = {"normal_texture": "turn highlights by half of its angle, and diffuse light not at all"}
 
 
 class Known:
@@ -115,6 +116,14 @@ class Recipe(eqx.Module):
             ValueError: The system does not support the part.
         """
 
+    def omits(self, shading: Shading) -> Mapping[str, str]:
+        """Fields of `TexturedMaterial` that the system does not show as they are, and what it shows in their place.
+
+        `precompute` warns of parts that have them. The coat, the sheen and the anisotropy that a part loses are named
+        by `jaxprt.relit.channels.of_part`, which takes them out of its material.
+        """
+        return {}
+
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
         """Smallest number of bytes of the system for a number of vertices and an edge of the light's faces."""
         return 0
@@ -198,6 +207,10 @@ class Harmonics(Recipe):
             return harmonic.DiffuseSystem(transport, shading.albedo)
         return harmonic.HarmonicSystem(transport, harmonic_table(shading, degree=self.degree), self.laplacian)
 
+    def omits(self, shading: Shading) -> Mapping[str, str]:
+        """Half of the angle of normal maps of glossy parts; ideally diffuse ones show all of it."""
+        return {} if shading.matte else _HALF
+
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
         """Number of bytes of the transfer vectors or matrices."""
         terms = (self.degree + 1) ** 2
@@ -221,6 +234,10 @@ class _OneBrdf(Recipe):
                 f"the separable system must have one roughness for all vertices, got a texture from {low:.2f} to "
                 f"{high:.2f}: use the lobe or the harmonic system"
             )
+
+    def omits(self, shading: Shading) -> Mapping[str, str]:
+        """Normal maps of ideally diffuse parts, and half of their angle of glossy ones."""
+        return {"normal_texture": "look flat"} if shading.matte else _HALF
 
 
 class Terms(_OneBrdf):

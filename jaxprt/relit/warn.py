@@ -12,6 +12,7 @@ import numpy as np
 from jaxprt.image import raster
 from jaxprt.relit import paths
 from jaxprt.relit.channels import Shading
+from jaxprt.relit.recipes import Recipe
 from jaxprt.scene import Camera, Mesh, Part, Scene, TexturedMaterial
 from jaxprt.scene.camera import localize
 from jaxprt.scene.mesh import bounds
@@ -23,6 +24,7 @@ _SMALLEST = 0.01  # share of the picture's rays that a part must meet: at silhou
 _POINTS = 64  # vertices of other parts that tell whether a part encloses them
 _SHELLS = 4  # parts with the extent of the whole scene that are looked at
 _HIDDEN = 0.99  # share of the upper hemisphere that an enclosing part hides
+_NAMED = 4  # parts that a warning names
 _GAIN = 1.02  # mean albedo up to which a BRDF may be 1 and rounded
 
 
@@ -140,3 +142,25 @@ def of_gain(scene: Scene, shadings: Sequence[Shading]) -> None:
                 "directions: surfaces that do not emit reflect at most 1; colors are from 0 to 1",
                 stacklevel=3,
             )
+
+
+def of_omissions(parts: Sequence[Part], shadings: Sequence[Shading], recipes: Sequence[Recipe]) -> None:
+    """Warns once of each feature of materials that the systems of some parts do not show, as `Recipe.omits` says.
+
+    Args:
+        parts: The parts of the scene.
+        shadings: The `Shading` of each part.
+        recipes: The recipe of each part.
+    """
+    names: dict[tuple[str, str, str], list[str]] = {}
+    for part, shading, recipe in zip(parts, shadings, recipes, strict=True):
+        for field, shown in recipe.omits(shading).items():
+            if getattr(part.material, field, None) is not None:
+                names.setdefault((type(recipe).__name__, field, shown), []).append(part.name)
+    for (recipe, field, shown), owners in names.items():
+        more = f" and {len(owners) - _NAMED} more" if len(owners) > _NAMED else ""
+        warnings.warn(
+            f"the system {recipe} does not show the {field} of the parts {owners[:_NAMED]}{more} as it is: they "
+            f"{shown}; use the lobe or the dynamic system for them",
+            stacklevel=3,
+        )

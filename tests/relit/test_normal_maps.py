@@ -1,6 +1,7 @@
 """Normal maps in pictures: a map of one texel, against the sum over all texels of the light with the tilted normal."""
 
 import functools
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import pytest
 
 import jaxprt as prt
 from jaxprt import lobe
-from jaxprt.relit import Harmonics, Lobes, RelitScene, canvas
+from jaxprt.relit import Clusters, Dynamic, Harmonics, Lobes, RelitScene, Terms, build, canvas, warn
 from jaxprt.relit.exact import exact_pixels
 from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial
 from jaxprt.scene.material import Texture
@@ -92,6 +93,36 @@ def test_matte_harmonics_reflect_linear_light_by_the_normal_of_the_map(hand):
     picture = np.asarray(ready.picture(linear, CAMERA, samples=1)).reshape(-1, 3)
     np.testing.assert_allclose(picture, np.broadcast_to(expected, picture.shape), rtol=0.01)
     np.testing.assert_allclose(ready.radiance(linear, eye=CAMERA.eye), np.broadcast_to(expected, (4, 3)), rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "material", "said"),
+    [
+        (Terms(), MATTE, "Terms does not show the normal_texture of the parts ['square'] as it is: they look flat"),
+        (Clusters(), MATTE, "Clusters .*: they look flat; use the lobe or the dynamic system"),
+        (Terms(), GLOSSY, "Terms .*: they turn highlights by half of its angle"),
+        (Clusters(), GLOSSY, "Clusters .*: they turn highlights by half of its angle"),
+        (Harmonics(), GLOSSY, "Harmonics .*: they turn highlights by half of its angle"),
+        (Harmonics(), MATTE, None),
+        (Lobes(), MATTE, None),
+        (Lobes(), GLOSSY, None),
+        (Dynamic(), MATTE, None),
+        (Dynamic(), GLOSSY, None),
+    ],
+)
+def test_systems_that_do_not_show_normal_maps_say_so(recipe, material, said):
+    parts = square(normal_texture=tilted(), **material).parts
+    shading = build.shaded(parts, [recipe])
+    with warnings.catch_warnings() if said is None else pytest.warns(UserWarning, match=said.replace("[", r"\[")):
+        warn.of_omissions(parts, shading, [recipe])
+        warn.of_omissions(square(**material).parts, shading, [recipe])
+
+
+def test_one_warning_names_all_parts_of_a_system():
+    parts = square(normal_texture=tilted(), **MATTE).parts * 6
+    with pytest.warns(UserWarning, match="and 2 more") as said:
+        warn.of_omissions(parts, build.shaded(parts, [Terms()] * 6), [Terms()] * 6)
+    assert len(said) == 1
 
 
 def test_lobes_are_turned_by_the_map_as_exact_pixels_are():
