@@ -220,7 +220,7 @@ def exact_picture(
     pictures = [resolve(shown.pixels, a, background=b) for a, b in zip(color, behind, strict=True)]
     surfaces, empty = [resolve(shown.pixels, light) for light in color], np.asarray(shown.pixels.background)
     alpha = 1 - (empty if empty.ndim == 2 else empty.mean(-1))
-    few = max(_FEWEST, np.count_nonzero(shown.owner >= 0) // _PER_PIXEL)
+    few = max(_FEWEST, int(np.sum(shown.owner >= 0)) // _PER_PIXEL)
     others = exact_pixels(whole, shadings, environments, asked, pixels=few, importance=importance(pictures), **options)
     error = [others.relative_l2(picture, light=light)[0] for light, picture in enumerate(pictures)]
     return ExactPicture(asked, np.stack(pictures), np.stack(surfaces), alpha, np.array(error))
