@@ -227,7 +227,7 @@ class _Compiled:
         self.programs = self.counted = 0
         jax.monitoring.register_event_duration_secs_listener(self._add)
 
-    def _add(self, event: str, _: float, **__: Any) -> None:
+    def _add(self, event: str, duration_secs: float, **kwargs: Any) -> None:
         self.programs += event == "/jax/core/compile/backend_compile_duration"
 
 
