@@ -199,10 +199,8 @@ def exact_picture(
         size = {"width": max(camera.width // step, 1), "height": max(camera.height // step, 1)}
         camera, asked = (dataclasses.replace(view, **size) for view in (camera, asked))
         shown = _PicturePoints.of(scene, camera)
-    lights, lamps = (
-        Environment(jnp.stack([light.radiance for light in environments])),
-        exact_lamps.Lamps.of(scene, shadings),
-    )
+    lights = Environment(jnp.stack([light.radiance for light in environments]))
+    lamps = exact_lamps.Lamps.of(scene, shadings)
     # Surfaces and lamps may have colors where the light is gray.
     color, colors = np.zeros((len(environments), len(shown.owner), 3), np.float32), lights.radiance.shape[-1]
     options = {"progress": progress, "between": between}
