@@ -19,7 +19,7 @@ from jaxprt.visibility.picture_rays import LampPlaces, PicturePoints, TexelRays
 COUNT = 4000  # rays of each path
 PATHS = ("blocked", "stopped", "passed", "hit", "layers", "shares", "lamps", "visibility")
 SETS = ("sse2", "sse4.2", "avx", "avx2", "avx512")
-LENGTH = 0.7  # seconds of rays for each path; in version 0.3 twice that undid 70 to 96 writes on most paths
+LENGTH = 0.7  # seconds of rays for each path; in version 0.3 twice that left 72 to 96 values wrong on most paths
 ROUNDED = 1e-4  # share of rays that pass an edge on its other side where products and sums are rounded apart
 
 
