@@ -313,7 +313,7 @@ class PictureLight(NamedTuple):
         return RowLight(self.arriving, self.traced, None if number is None else self.reflections[number], glow)
 
 
-def check(taker: Any, environments: Sequence[Any], shadows: Any = "rays") -> None:
+def check(taker: Any, environments: Sequence[Any], *, shadows: Any = "rays") -> None:
     """Refuses what is not one light of a size that a scene, or a view of it, takes, and shadows that are not text."""
     if not isinstance(shadows, str):
         raise TypeError(f'shadows must be "rays" or "vertices", got {require.shown(shadows)}')

@@ -505,7 +505,7 @@ class RelitScene(System):
             ValueError: The environment is a batch or of another size than the scene takes, `samples` is another number,
                 `background` or `layers` is none of the above, or for the reasons that `view` gives.
         """
-        pictures.check(self, [environment], shadows)
+        pictures.check(self, [environment], shadows=shadows)
         view = self._picture_view(camera, materials, samples=samples, keep=False, shadow=shadows, between=between)
         return view.picture(environment, background=background, layers=layers, between=between)
 
@@ -565,7 +565,7 @@ class RelitScene(System):
         batches.check(environments, cameras)
         require.number("memory", memory, 0.0, above=True)
         lights = batches.of_one_size(environments, self.light_size)
-        pictures.check(self, lights, shadows)
+        pictures.check(self, lights, shadows=shadows)
         options = {"samples": samples, "keep": False, "shadow": shadows, "between": None}
         view_of = partial(self._picture_view, materials=materials, **options)
         return batches.blocks(view_of, lights, cameras, memory=int(memory), background=background, layers=layers)
