@@ -17,7 +17,7 @@ class Hand:
 
     def __init__(self, browser, url):
         self.page = browser.new_page(viewport={"width": WIDTH, "height": 320})
-        self.page.set_default_timeout(60_000)  # two workers may take all cores
+        self.page.set_default_timeout(180_000)  # two workers may take all cores, and a picture at rest compiles for 40 s
         self.errors = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.goto(url)
@@ -32,7 +32,7 @@ class Hand:
     def camera(self):
         return self.page.evaluate(f"() => {{ const c = ({CANVAS}).camera(); return {{ ...c, eye: c.eye }}; }}")
 
-    def wait(self, condition, seconds=60):
+    def wait(self, condition, seconds=180):
         """Until something is true of the counters."""
         self.page.wait_for_function(
             f"() => {{ const stats = ({CANVAS})?.stats; return stats && stats.{condition}; }}", timeout=1000 * seconds
