@@ -116,10 +116,6 @@ def finite(name: str, value: Any) -> None:
     Args:
         name: Description of the value for the message, such as "the eye".
         value: A number or an array.
-
-    Raises:
-        TypeError: The value does not consist of real numbers.
-        ValueError: Some values are not finite or too large. The message states how many, and the position of the first.
     """
     real(name, value)
     known = _array_of(value)
@@ -266,9 +262,6 @@ def between(name: str, value: int | None, low: int, high: int) -> None:
         value: The number; None passes.
         low: Smallest allowed value.
         high: Largest allowed value.
-
-    Raises:
-        ValueError: The number is outside the range.
     """
     if value is None:
         return
@@ -287,10 +280,6 @@ def within(name: str, value: Any, low: int, high: int) -> None:
         value: The array.
         low: Smallest allowed value.
         high: Largest allowed value.
-
-    Raises:
-        TypeError: The value does not consist of real numbers.
-        ValueError: Some numbers are outside the range. The message states how many, and the position of the first.
     """
     real(name, value)
     known = _array_of(value)
@@ -376,9 +365,6 @@ def kind(name: str, value: Any, *wanted: type, source: str) -> None:
         value: The object.
         wanted: The allowed classes.
         source: Name of the function that makes such an object, for the message.
-
-    Raises:
-        TypeError: The object is of another class.
     """
     if not isinstance(value, wanted):
         names = " or ".join(kind.__name__ for kind in wanted)

@@ -13,11 +13,7 @@ from jaxprt.compile import mapped
 
 
 def as_argument(brdf: Callable) -> Callable:
-    """A BRDF as an argument for jitted functions. Plain functions are not arrays and are wrapped.
-
-    Raises:
-        TypeError: The BRDF is a table whose values already include the cosine of the light direction.
-    """
+    """A BRDF as an argument for jitted functions. Plain functions are not arrays and are wrapped."""
     if getattr(brdf, "holds_cosine", False):
         raise TypeError(
             f"the BRDF must return values in 1/sr, got a {type(brdf).__name__}, whose values include the cosine of the "
@@ -61,12 +57,7 @@ def check_family(brdf: Any, knot: Any) -> None:
 
 
 def check_knots(knot: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
-    """The knots of each parameter, converted to float64.
-
-    Raises:
-        ValueError: There are more than two parameters, or a parameter does not have at least two finite increasing
-            knots.
-    """
+    """The knots of each parameter, converted to float64."""
     for number, values in enumerate(knot):
         require.real(f"knots of parameter {number}", values)
     if len(knot) > 2:

@@ -318,11 +318,7 @@ def check_unique(path: str | pathlib.Path, names: list[str]) -> None:
 
 
 def one_of(material: str, known: list[str], path: str | pathlib.Path) -> str:
-    """Returns the name of the material if the file has it.
-
-    Raises:
-        ValueError: The file does not have the material. The message lists similar names.
-    """
+    """Returns the name of the material if the file has it."""
     if material not in known:
         near = difflib.get_close_matches(material, known, 5, 0.4) or known[:5]
         raise ValueError(

@@ -242,9 +242,6 @@ class MetallicRoughness(Model):
 
         One table per term therefore serves all textures of color, metallic, ior and specular. `needed` tells which
         terms can be left out.
-
-        Raises:
-            ValueError: Roughness, anisotropy or rotation varies between vertices.
         """
         for name in ("roughness", "anisotropy", "rotation"):
             if (shape := getattr(self, name).shape) != ():

@@ -71,9 +71,6 @@ def blinn_phong(*, exponents: Sequence[int | float] = range(1, 201)) -> Family:
 
     Returns:
         The family. Its coordinate is the exponent.
-
-    Raises:
-        ValueError: There are fewer than two exponents, or they are not finite, not increasing or negative.
     """
     knot = np.asarray(exponents, float)
     if knot.ndim != 1 or len(knot) < 2 or not (np.isfinite(knot).all() and knot[0] >= 0 and np.all(np.diff(knot) > 0)):

@@ -41,9 +41,6 @@ class Line(eqx.Module):
 
         They are differentiable in the coordinate and the knots. At a knot the derivative is that from above, at the
         last knot that from below.
-
-        Raises:
-            ValueError: The coordinate is not a single number.
         """
         knot = self.chart(self.knot)
         low, upper = _neighbors(knot, self.chart(_check_coordinate(coordinate, ())), len(knot))
@@ -78,9 +75,6 @@ class Plane(eqx.Module):
         They are continuous, and differentiable in the coordinate and the points for a fixed triangulation. The
         derivative is that of the selected triangle or edge. It is one-sided where several meet, and zero where the
         nearest point of the boundary remains a vertex.
-
-        Raises:
-            ValueError: There are not two coordinates.
         """
         return _weight(self, _check_coordinate(coordinate, (2,)))
 
@@ -117,9 +111,6 @@ class Columns(eqx.Module):
         They are continuous, and differentiable in the coordinate and the points for fixed columns. At a point the
         derivative is that from above, at the last point that from below. Outside, the derivative across the border is
         zero.
-
-        Raises:
-            ValueError: There are not two coordinates.
         """
         return _column_weight(self, _check_coordinate(coordinate, (2,)))
 
@@ -142,10 +133,6 @@ def triangulate(
 
     Returns:
         The triangulation.
-
-    Raises:
-        ValueError: There are fewer than three points, a point is not finite, two coincide, or all lie on one line;
-            the latter two up to rounding, in the chart.
     """
     point, scaled, rounding = _apart(point, chart, name)
     try:
@@ -192,10 +179,6 @@ def columns(
 
     Returns:
         The columns.
-
-    Raises:
-        ValueError: There are fewer than four points, a point is not finite, two coincide up to rounding in the chart,
-            or the points are not in columns.
     """
     point, scaled, rounding = _apart(point, chart, name)
     if not in_columns(point, chart=chart):

@@ -73,11 +73,6 @@ def read_scattered(
     Returns:
         For each sample the direction to the light, the direction to the viewer, and the BRDF in linear RGB, converted
         by ``spectrum_to_rgb``.
-
-    Raises:
-        FileNotFoundError: The file does not exist.
-        ValueError: The file does not have this form, or holds no samples, values that are negative, not finite or above
-            ``jaxprt.brdf.measured.LARGEST``, or directions below the horizon.
     """
     number = _numbers(path)
     count = int(number[0]) if number.size and number[0] == np.floor(number[0]) and 0 < number[0] < 1e6 else 0
@@ -153,11 +148,6 @@ def interpolate_scattered(
 
     Returns:
         The BRDF. ``jaxprt.brdf.measured.tabulate`` explains its ``filled``.
-
-    Raises:
-        ValueError: There are fewer than ten different samples, all lie on one plane, or an option is out of range.
-        MemoryError: There are too many samples.
-
     Reference: Kautz, Sloan, Snyder 2002, "Calculating BRDF Coefficients", for radial basis functions. The choice of
     coordinates is new.
     """
@@ -221,10 +211,6 @@ def spectrum_to_rgb(
 
     Returns:
         Color in the units of the values.
-
-    Raises:
-        ValueError: The wavelengths do not cover 430 to 650 nm, or are more than 40 nm apart.
-
     Reference: Wyman, Sloan, Shirley 2013, "Simple Analytic Approximations to the CIE XYZ Color Matching Functions",
     the multi-lobe fit of the 2-degree observer of 1931; CIE 15 for D65; ITU-R BT.709 for the primaries.
     """

@@ -100,11 +100,7 @@ def _versions(here: dict[str, Any]) -> str:
 
 
 def describe_path(path: Path, light_size: int, *, outside: bool) -> dict[str, Any]:
-    """Describes the content of a file or folder, as JSON.
-
-    Raises:
-        ValueError: The file is of an unknown kind or damaged.
-    """
+    """Describes the content of a file or folder, as JSON."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         description = {"path": str(path), **_describe_file(path, light_size, outside)}

@@ -53,12 +53,7 @@ _PLASTIC = TexturedMaterial(base_color=(0.4, 0.1, 0.08), metallic=0.0, roughness
 
 
 def parse(text: str) -> Callable | TexturedMaterial:
-    """Parses the text form of a material.
-
-    Raises:
-        ValueError: A model, parameter or file does not exist, or a value is not a number or out of range.
-        OSError: A file cannot be read.
-    """
+    """Parses the text form of a material."""
     models = registry.materials()
     name, _, rest = text.partition(":")
     words = [word.strip() for word in rest.split(",")] if rest.strip() else []
@@ -95,11 +90,7 @@ def parameters(name: str) -> dict[str, float | None]:
 
 
 def of_part(text: str) -> tuple[str, str]:
-    """Splits PART=MATERIAL into the part and the material.
-
-    Raises:
-        ValueError: The text does not have this form.
-    """
+    """Splits PART=MATERIAL into the part and the material."""
     part, equals, material = text.partition("=")
     if not (part and equals and material):
         raise ValueError(f"must be PART=MATERIAL, such as 0=lambert:albedo=.5, got {text!r}")
@@ -181,11 +172,7 @@ def kind(path: Path) -> str:
 
 
 def split_files(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """Separates files into meshes and environments.
-
-    Raises:
-        ValueError: A file is neither a mesh nor an environment.
-    """
+    """Separates files into meshes and environments."""
     kinds = [(kind(path), path) for path in files]
     for contents, path in kinds:
         if not contents:
@@ -265,9 +252,6 @@ def lights(options: SimpleNamespace, *, size: int = _SIZE) -> dict[str, Environm
     Args:
         options: Object with `files`, `turn` and `light_size`.
         size: Texels along a face's edge if `light_size` is None.
-
-    Raises:
-        ValueError: The size is not a power of two, or a file is not an environment.
     """
     _, paths = split_files(options.files)
     size = _light_size(options, size)

@@ -32,12 +32,7 @@ class Program(click.Group):
         return list(self.commands)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Runs a command.
-
-        Raises:
-            click.ClickException: The command failed; exit status 2 for wrong input, 1 for other failures.
-            click.exceptions.Exit: The command was interrupted; exit status 130.
-        """
+        """Runs a command."""
         warnings.showwarning = lambda message, *_, **__: click.echo(f"Warning: {message}", err=True)
         try:
             return super().invoke(ctx)

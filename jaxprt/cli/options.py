@@ -108,11 +108,7 @@ class Finite(click.ParamType):
         self._ends, self._open = (least, most), open
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Parses the number.
-
-        Raises:
-            click.UsageError: The value is not a finite number in the range.
-        """
+        """Parses the number."""
         number = _parse_number(float, value)
         if number is None or not math.isfinite(number) or not _inside(number, *self._ends, open=self._open):
             self.fail(
@@ -125,11 +121,7 @@ class Whole(click.IntRange):
     """A whole number in a range."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Parses the number.
-
-        Raises:
-            click.UsageError: The value is not a whole number in the range.
-        """
+        """Parses the number."""
         number = _parse_number(int, value)
         if number is None or not _inside(number, self.min, self.max, open=False):
             self.fail(
@@ -197,11 +189,7 @@ class Bounces(click.ParamType):
     name = "N|all"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
-        """Parses the number or "all".
-
-        Raises:
-            click.UsageError: The value is neither.
-        """
+        """Parses the number or "all"."""
         if value != "all" and not str(value).isdecimal():
             self.fail(f'must be a whole number of at least 0, or "all", got {value!r}', param, ctx)
         return value if value == "all" else int(value)
@@ -213,11 +201,7 @@ class Refinement(click.ParamType):
     name = "E|off"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | bool:
-        """Parses the error; "off" gives False.
-
-        Raises:
-            click.UsageError: The value is neither.
-        """
+        """Parses the error; "off" gives False."""
         if isinstance(value, bool) or value == "off":
             return bool(value) and value != "off"
         try:
@@ -235,11 +219,7 @@ class Material(click.ParamType):
     name = "material"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Parses the material.
-
-        Raises:
-            click.UsageError: The text is not a material.
-        """
+        """Parses the material."""
         try:
             return inputs.parse(value) if isinstance(value, str) else value
         except (ValueError, OSError) as error:
@@ -264,11 +244,7 @@ class OfPart(Material):
     name = "part=material"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Parses the part and its material.
-
-        Raises:
-            click.UsageError: The text does not have this form, or its material is wrong.
-        """
+        """Parses the part and its material."""
         if not isinstance(value, str):
             return value
         try:

@@ -119,11 +119,7 @@ def parse_options(arguments: Sequence[str]) -> SimpleNamespace:
 
 
 def check_port(port: int) -> None:
-    """Refuses a port that cannot be used, before anything is computed.
-
-    Raises:
-        ValueError: The port is in use or not permitted.
-    """
+    """Refuses a port that cannot be used, before anything is computed."""
     if port:
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as attempt:
             attempt.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # the same option that servers set
@@ -134,11 +130,7 @@ def check_port(port: int) -> None:
 
 
 def check_address(address: str | None) -> None:
-    """Refuses an address that no browser can come by, before anything is computed.
-
-    Raises:
-        ValueError: It is not the address of a page.
-    """
+    """Refuses an address that no browser can come by, before anything is computed."""
     if address is not None:
         try:
             parse(address)

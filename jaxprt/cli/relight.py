@@ -182,11 +182,7 @@ def _part(text: str | None) -> blocks.Shard | None:
 
 
 def load_plan(folder: Path) -> Plan:
-    """Loads the plan in a folder that `jaxprt plan` or a planned run has written.
-
-    Raises:
-        ValueError: The folder has no plan.
-    """
+    """Loads the plan in a folder that `jaxprt plan` or a planned run has written."""
     inside = folder / "plan"
     path = inside if inside.is_dir() else folder
     try:
@@ -199,11 +195,7 @@ def load_plan(folder: Path) -> Plan:
 
 
 def make_folder(path: Path, *, name: str = "--output") -> None:
-    """Creates the folder of the option `name`, before anything is computed.
-
-    Raises:
-        ValueError: The folder cannot be created or written to.
-    """
+    """Creates the folder of the option `name`, before anything is computed."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -19,9 +19,6 @@ def bisect(point: Float[np.ndarray, "v f"], *, clusters: int) -> Int[np.ndarray,
 
     Returns:
         Indices of the m = ceil(v / clusters) points of each cluster. A cluster with one point fewer repeats its last.
-
-    Raises:
-        ValueError: `clusters` is below 1 or above the number of points, or a point is not finite.
     """
     if not 1 <= clusters <= len(point):
         raise ValueError(f"clusters must be between 1 and the {len(point)} points, got {clusters}")

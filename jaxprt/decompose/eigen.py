@@ -95,10 +95,6 @@ def symmetric(
     Returns:
         Eigenvalues by descending magnitude; unit eigenvectors as columns; and, after each sweep, the relative residual
         |A V - V D| / |D| of the returned pairs.
-
-    Raises:
-        ValueError: `terms` is below 1 or above the number of rows.
-
     Reference: Musco and Musco 2015, algorithm 2; for the use, Wang, Tran, Luebke 2004, appendix.
     """
     _check(terms, matrix.shape[0])
@@ -124,9 +120,6 @@ def left_singular(
     Returns:
         Squared singular values in descending order; orthonormal vectors as columns; and, after each sweep, the
         relative residual of these eigenpairs of M C M^T.
-
-    Raises:
-        ValueError: `terms` is below 1 or above the number of rows or columns.
     """
     _check(terms, min(matrix.shape))
 
@@ -159,10 +152,6 @@ def power(
         Eigenvalues in the order found (descending magnitude if they have converged); unit vectors as columns
         (orthogonal if they have converged); and, after each sweep of each term, the relative residual
         |A v - value v| / |value|.
-
-    Raises:
-        ValueError: `terms` is below 1 or above the number of rows.
-
     Reference: Wang, Tran, Luebke 2004, appendix.
     """
     size, dtype = matrix.shape[0], matrix.dtype

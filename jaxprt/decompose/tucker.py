@@ -97,10 +97,6 @@ def hosvd(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...]) -> Tucker:
         in the tensor. Derivatives of a single factor hold only up to rotations among its columns, so functions of it
         must not depend on such rotations. Where singular values on both sides of the truncation are equal, the subspace
         has no derivative and the result is zero.
-
-    Raises:
-        ValueError: The number of ranks is not the number of modes, or a rank is not between 1 and its mode's size.
-
     Reference: De Lathauwer, De Moor, Vandewalle 2000.
     """
     _check(tensor, ranks)
@@ -120,10 +116,6 @@ def truncated(tensor: Float[Array, "*n"], *, ranks: tuple[int, ...]) -> Tucker:
 
     Returns:
         The decomposition, differentiable in the same sense as that of `hosvd`.
-
-    Raises:
-        ValueError: The number of ranks is not the number of modes, or a rank is not between 1 and its mode's size.
-
     Reference: Vannieuwenhoven, Vandebril, Meerbergen 2012.
     """
     _check(tensor, ranks)

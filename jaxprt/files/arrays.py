@@ -53,11 +53,7 @@ def write_header(file: BinaryIO, shape: tuple[int, ...], dtype: str) -> None:
 
 
 def read_header(path: Path, shape: tuple[int, ...], dtype: str) -> int:
-    """Byte offset of the values of an array in its file.
-
-    Raises:
-        ValueError: The file is not in NumPy's format, or has another shape or type.
-    """
+    """Byte offset of the values of an array in its file."""
     with path.open("rb") as file:
         version = np.lib.format.read_magic(file)
         if version != _VERSION:
@@ -69,11 +65,7 @@ def read_header(path: Path, shape: tuple[int, ...], dtype: str) -> int:
 
 
 def open_array(path: Path, offset: int, shape: tuple[int, ...], dtype: str) -> np.ndarray:
-    """A read-only memory map of an array in a file.
-
-    Raises:
-        ValueError: The file is too short.
-    """
+    """A read-only memory map of an array in a file."""
     if 0 in shape:
         return np.zeros(shape, dtype)
     end = offset + int(np.prod(shape)) * np.dtype(dtype).itemsize
@@ -105,11 +97,7 @@ class Reference(NamedTuple):
     dtype: str
 
     def open(self) -> np.ndarray:
-        """Maps the array in this process.
-
-        Raises:
-            FileNotFoundError: This machine has no access to the file.
-        """
+        """Maps the array in this process."""
         try:
             return open_array(Path(self.path), *self[1:])
         except FileNotFoundError as error:
@@ -146,11 +134,7 @@ def empty(shape: tuple[int, ...], dtype: str) -> np.ndarray:
 
 
 def read_into(file: Any, value: np.ndarray) -> None:
-    """Fills an array with the next bytes of an unbuffered file.
-
-    Raises:
-        EOFError: The file ends too early.
-    """
+    """Fills an array with the next bytes of an unbuffered file."""
     left = value.reshape(-1).view(np.uint8).data
     while left:
         count = file.readinto(left)
@@ -181,10 +165,6 @@ class BlockStore:
 
     Attributes:
         path: Folder of the store.
-
-    Raises:
-        ValueError: The path is not a store, has another version of the format or algorithm, or holds arrays that were
-            computed from other inputs.
     """
 
     def __init__(
@@ -218,11 +198,7 @@ class BlockStore:
 
     @contextmanager
     def writing(self, part: tuple[int, int] = (1, 1)) -> Iterator[None]:
-        """Locks the k-th of n parts of the store for writing. The lock is released however the process ends.
-
-        Raises:
-            BlockingIOError: Another process is writing the same part, or the store is being written in other parts.
-        """
+        """Locks the k-th of n parts of the store for writing. The lock is released however the process ends."""
         number, count = part
         lock = self.path / f".lock.{number}-of-{count}"
         try:
@@ -241,11 +217,7 @@ class BlockStore:
             ) from None
 
     def write(self, block: int, array: Mapping[str, np.ndarray]) -> None:
-        """Writes one block of every array, converted to the layout's types, and then its checksum.
-
-        Raises:
-            OSError: The disk is full, or the file system fails in another way. Other blocks are not affected.
-        """
+        """Writes one block of every array, converted to the layout's types, and then its checksum."""
         value = {name: np.ascontiguousarray(array[name], at.dtype) for name, at in self._layout.items()}
         for name, at in self._layout.items():
             if value[name].shape != at.shape:

@@ -21,11 +21,7 @@ def is_data(kind: type) -> bool:
 
 
 def allow(kinds: Sequence[type]) -> None:
-    """Lets files hold objects of data classes of another package. Their fields are annotated as those of jaxprt are.
-
-    Raises:
-        TypeError: One of them is not a data class.
-    """
+    """Lets files hold objects of data classes of another package. Their fields are annotated as those of jaxprt are."""
     for kind in kinds:
         if not isinstance(kind, type) or not is_data(kind):
             name = getattr(kind, "__name__", kind)

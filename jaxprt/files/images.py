@@ -86,10 +86,6 @@ def read_exr(path: pathlib.Path, name: str) -> tuple[Float32[np.ndarray, "h w c"
     Returns:
         The pixels of the display window, and the attributes of the part. The chromaticities among them are those of the
         file, not of the pixels.
-
-    Raises:
-        ValueError: The file is damaged, or has no part that can be read.
-        MemoryError: The pixels do not fit into memory.
     """
     part = _color_part(_headers(path, name), name)
     rows, columns = part.window("displayWindow")
@@ -287,10 +283,6 @@ def read_radiance(path: pathlib.Path, name: str) -> tuple[Float32[np.ndarray, "h
 
     Returns:
         The pixels, the right way up, and the variables of the header. "EXPOSURE" is the product of all exposures.
-
-    Raises:
-        ValueError: The file is damaged, or holds XYZ.
-        MemoryError: The pixels do not fit into memory.
     """
     content = inputs.content(path, "an image file")
     try:
@@ -477,11 +469,6 @@ def read_ktx2(
 
     Returns:
         The pixels with 3 (RGB) or 4 (RGBA) channels, and no attributes.
-
-    Raises:
-        ImportError: The package opengl_basisu is missing.
-        ValueError: The file is damaged, has several faces or layers, or holds no Basis Universal payload.
-        MemoryError: The pixels do not fit into memory.
     """
     try:
         import opengl_basisu

@@ -76,11 +76,6 @@ def content(path: pathlib.Path, what: str) -> bytes:
     Args:
         path: The file.
         what: Kind of the file for messages, such as "a mesh file".
-
-    Raises:
-        FileNotFoundError: Nothing has this name.
-        ValueError: It is a directory, a pipe, a device or a socket.
-        MemoryError: The file does not fit into memory.
     """
     check(path, what)
     require.memory(f"the bytes of {path}", path.stat().st_size, "free some memory, or make the file smaller")
@@ -101,9 +96,6 @@ def require_inside(path: pathlib.Path, folder: pathlib.Path, *, owner: str, outs
 
     Returns:
         The path, unchanged.
-
-    Raises:
-        ValueError: The file is outside of the folder. The message names the file.
     """
     if outside:
         return path
@@ -126,12 +118,6 @@ def json_object(path: pathlib.Path, what: str) -> dict[str, Any]:
     Args:
         path: The file.
         what: Kind of the file for messages, such as "a file of BRDFs".
-
-    Raises:
-        FileNotFoundError: Nothing has this name.
-        ValueError: It is no regular file, no JSON in UTF-8, nested too deeply, has a name twice in one object, or holds
-            something other than an object.
-        MemoryError: The file does not fit into memory.
     """
     data = content(path, what)
     try:

@@ -36,13 +36,7 @@ LAYERS = {
 
 
 def target(path: str | os.PathLike, suffix: str) -> pathlib.Path:
-    """Checks, before the work begins, that a file with this suffix can be written.
-
-    Raises:
-        TypeError: The path is not a path.
-        ValueError: The suffix is another one.
-        OSError: For the reasons of `replacing`, as far as they are known before the file is written.
-    """
+    """Checks, before the work begins, that a file with this suffix can be written."""
     require.path("path", path)
     if pathlib.Path(path).suffix.lower() != suffix:
         raise ValueError(f"path must end in {suffix}, because the file will be of that format, got {os.fspath(path)!r}")
@@ -66,11 +60,6 @@ def replacing(path: str | os.PathLike) -> Iterator[pathlib.Path]:
 
     Yields:
         Path of the new file, with the suffix of `path`.
-
-    Raises:
-        FileNotFoundError: The folder does not exist.
-        OSError: The path is a directory, a pipe or a device; the old file or the folder cannot be written; or the disk
-            is full. The message names the path.
     """
     target = pathlib.Path(os.path.realpath(path))
     mode = _old_mode(path, target)

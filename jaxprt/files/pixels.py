@@ -40,9 +40,6 @@ def check_size(name: str | pathlib.Path, height: int, width: int) -> None:
         name: The image, for the message.
         height: Rows that the header states.
         width: Columns that the header states.
-
-    Raises:
-        ValueError: The number of pixels is below 1 or above `MAX_PIXELS`.
     """
     if height < 1 or width < 1 or height * width > MAX_PIXELS:
         raise ValueError(
@@ -60,9 +57,6 @@ def check_memory(name: str | pathlib.Path, height: int, width: int, channels: in
         width: Columns.
         channels: Channels that are read, as float32.
         decoder: Bytes that the decoder allocates besides.
-
-    Raises:
-        MemoryError: The image does not fit. The message states its size, how much is needed, and how much is free.
     """
     require.memory(
         f"{name}: {width} x {height} pixels (width x height) of {channels} channels",
@@ -97,9 +91,6 @@ def read_block(reader: Any, rows: range, *, part: int = 0, channels: range, form
 
     Returns:
         The pixels, [rows, w, channels].
-
-    Raises:
-        ValueError: The file is damaged. The message is the decoder's.
     """
     spec = reader.spec()
     span = channels.start, channels.stop, form
@@ -143,9 +134,6 @@ def read_rows(reader: Any, image: np.ndarray) -> None:
     Args:
         reader: The opened file, an `OpenImageIO.ImageInput`.
         image: The array [h, w, c] to fill, of all channels of the file.
-
-    Raises:
-        ValueError: The file is damaged. The message is the decoder's.
     """
     spec = reader.spec()
     step = block_rows(spec)
@@ -201,10 +189,6 @@ def to_rec709(chromaticities: Sequence[float], name: str) -> Float64[np.ndarray,
 
     Returns:
         The matrix, for colors in columns; None if the primaries are those of Rec. 709.
-
-    Raises:
-        ValueError: The chromaticities are not finite, or are no primaries.
-
     Reference: SMPTE RP 177; Lindbloom, "Chromatic adaptation"; ITU-R BT.709.
     """
     if len(chromaticities) == 8 and np.abs(np.subtract(chromaticities, REC709)).max() < _SAME:
@@ -341,11 +325,6 @@ def png_damage(content: bytes, name: str) -> str:
     Args:
         content: The file.
         name: Name of the file in messages.
-
-    Raises:
-        ValueError: There are more pixels than `check_size` allows.
-        MemoryError: The pixels do not fit into memory.
-
     Reference: PNG specification, third edition, sections 5, 7, 9 and 11.2.
     """
     chunk, damage = _needed_chunks(content)

@@ -467,9 +467,6 @@ def visible_points(
         occluder: The same triangles with their opacity; None if all of them are opaque.
         uneven: Triangles of which each sample becomes a point; see `pixels.shading_points`.
         between: Function that is called between steps of the work.
-
-    Raises:
-        ValueError: The camera is traced by JAX, and there are surfaces with an opacity.
     """
     if occluder is None or occluder.opacity is None:
         shown = seen_from_front(mesh, camera, hidden)

@@ -49,12 +49,7 @@ class UnnamedError(Exception):
 
 
 def surroundings() -> str:
-    """All that a program depends on besides its function and arguments.
-
-    Raises:
-        UnnamedError: The files of the package have changed since they were imported.
-        OSError: The files of the package cannot be read.
-    """
+    """All that a program depends on besides its function and arguments."""
     device = jax.devices()[0]
     context = _CLEAN.sub("", str(config.trace_context()))
     if " at 0x" in context:
@@ -88,11 +83,7 @@ def _process_facts() -> str:
 
 
 def describe(value: Any) -> str:
-    """A text that names a static value or the structure of a pytree, the same in every process.
-
-    Raises:
-        UnnamedError: The value is an object of unknown code, such as a class of the user.
-    """
+    """A text that names a static value or the structure of a pytree, the same in every process."""
     kind = type(value)
     if value is None or kind in (bool, int, float, complex, str, bytes):
         return repr(value)

@@ -67,11 +67,7 @@ class Cache(NullCache):
 
 
 def describe(loop: Any) -> str:
-    """A text that changes with all that numba compiles into a loop: its code, what it calls, and what these read.
-
-    Raises:
-        UnnamedError: It reads a value of a kind that loops do not read.
-    """
+    """A text that changes with all that numba compiles into a loop: its code, what it calls, and what these read."""
     return "\n".join(_texts(loop, (), set()))
 
 

@@ -61,13 +61,7 @@ def check(environments: Any, cameras: Any) -> None:
 
 
 def check_array(environments: Any, cameras: Any, layers: Sequence[str] | None) -> None:
-    """Refuses lights and cameras whose pictures are not one array, or do not fit into memory.
-
-    Raises:
-        TypeError: For the reasons of `check`.
-        ValueError: For the reasons of `check`, or the cameras have different sizes.
-        MemoryError: The array does not fit into memory.
-    """
+    """Refuses lights and cameras whose pictures are not one array, or do not fit into memory."""
     check(environments, cameras)
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     if len(sizes) > 1:

@@ -142,9 +142,6 @@ def of_part(
         look: The material at the vertices, in NumPy; evaluated here if None.
         takes: Function that says whether the system reads a standard table. If it does not, the channels are the terms
             that the material needs, and the system is made for the roughness that it has.
-
-    Raises:
-        TypeError: The material is one BRDF for each vertex, or a table that already includes the cosine.
     """
     material = part.material
     if isinstance(material, PerVertex):
@@ -339,11 +336,6 @@ def appearance(part: Part, shading: Shading, material: Changeable, *, look: Mate
         shading: The `Shading` of the part, from `of_part`.
         material: The new material.
         look: The new material at the vertices; evaluated here if None.
-
-    Raises:
-        ValueError: The material uses texture coordinates that the mesh lacks, has a normal map that was not
-            precomputed, or a term, a roughness or an anisotropy that the part's own tables lack.
-        TypeError: The new material is of another model than the precomputed one.
     """
     new = _replace_material(part, shading, material)
     look = _look(new) if look is None else look

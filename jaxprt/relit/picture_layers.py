@@ -60,9 +60,6 @@ def of_points(
         camera: The camera of the drawn pixels, relative to the origin of the scene.
         names: Names of layers, without those of light and alpha.
         fold: Edge in drawn pixels of the squares that are averaged to one pixel of the picture.
-
-    Raises:
-        TypeError: JAX traces the camera or the mesh.
     """
     if isinstance(pixels.triangle, Tracer):
         raise TypeError("layers besides light need a known camera and mesh: make the picture outside of jax.jit")

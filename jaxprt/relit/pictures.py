@@ -106,13 +106,7 @@ class PictureView(eqx.Module):
         layers: Sequence[str] | None = None,
         between: Between = None,
     ) -> Any:
-        """Renders the picture under an environment, in linear radiance. `RelitScene.picture` explains the options.
-
-        Raises:
-            TypeError: `environment` is not an `Environment`, or for the reasons of `RelitScene.picture`.
-            ValueError: The environment is a batch, or has another size than the systems require, or for the reasons of
-                `RelitScene.picture`.
-        """
+        """Renders the picture under an environment, in linear radiance. `RelitScene.picture` explains the options."""
         return self.pictures([environment], background=background, layers=layers, between=between)[0]
 
     @promoted
@@ -162,11 +156,6 @@ class PictureView(eqx.Module):
             A dictionary of pictures: one for each region and for each lamp of the scene, by their names, "rest" for the
             rest of the environment, and "background" for what is seen of it. Their sum is `picture` exactly: the rest
             is what the others leave of it.
-
-        Raises:
-            TypeError: `environment` is not an `Environment`, or `regions` is not a dictionary of arrays.
-            ValueError: A name is that of another layer, or the shares of a region are not [6, n, n] finite numbers from
-                0 to 1 as the environment has texels.
         """
         check(self, [environment])
         parts = _regions(environment, {} if regions is None else regions, (*self.lamps, *_TAKEN))

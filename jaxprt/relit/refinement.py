@@ -106,10 +106,6 @@ def divided(
         environments: Lights, as in `refine`. Their brightest texels do not count, because pictures trace their shadows.
         folder: Folder in which the division is stored.
         progress: Whether to show a progress bar, or a function; see `jaxprt.Run`.
-
-    Raises:
-        TypeError: `wanted` is neither a number nor a truth value.
-        ValueError: `wanted` is negative, or the stored division is of another scene.
     """
     if isinstance(wanted, bool | np.bool_):
         if not wanted:

@@ -268,11 +268,7 @@ def check_rays(rays: Any) -> None:
 
 
 def check_more_rays(rays: Any, before: int, surfaces: Sequence[Surface]) -> None:
-    """`check_rays`, for a scene with a number of rays before; without the lobes that rays are for, it gets none.
-
-    Raises:
-        ValueError: `rays` is not such a number, or the scene was precomputed for harmonics alone.
-    """
+    """`check_rays`, for a scene with a number of rays before; without the lobes that rays are for, it gets none."""
     check_rays(rays)
     reflecting = [surface for surface in surfaces if surface.reflecting is not None]
     if rays and not before and reflecting and not any(surface.has_rays for surface in reflecting):

@@ -259,9 +259,6 @@ def plane(*, cells: int = 16) -> Mesh:
 
     Returns:
         A mesh of (cells + 1)^2 vertices.
-
-    Raises:
-        ValueError: Fewer than 1 cell.
     """
     if cells < 1:
         raise ValueError(f"cells must be at least 1, got {cells}")

@@ -343,11 +343,6 @@ def resample(
 
     Returns:
         Mean radiance of each texel.
-
-    Raises:
-        TypeError: The size is not a whole number.
-        ValueError: The layout is unknown or cannot have the image's shape, or the size is below 1.
-        MemoryError: The cubemap does not fit into memory.
     """
     _check_layout(image, layout, "image")
     _check_size(image.shape, layout, size)
@@ -542,9 +537,6 @@ def resized(light: Environment, *, size: int) -> Environment:
 
     Texels come from the pixels of the light's file as in `finer`, or else from its texels: means of them, or each
     repeated.
-
-    Raises:
-        ValueError: Neither of the sizes is a multiple of the other, and the light does not have the pixels of a file.
     """
     edge = light.radiance.shape[-2]
     if edge == size or light.panorama is not None:
@@ -606,11 +598,7 @@ def sky(
 
 
 def layout_of(image: np.ndarray, attributes: Mapping[str, object], name: str) -> str:
-    """The layout that an image file states in its EXR attribute ``envmap``, or else that its shape implies.
-
-    Raises:
-        ValueError: The image has the shape of no layout.
-    """
+    """The layout that an image file states in its EXR attribute ``envmap``, or else that its shape implies."""
     if (stated := _STATED.get(str(attributes.get("envmap")))) is not None:
         return stated
     height, width = image.shape[:2]

@@ -39,10 +39,6 @@ def importance(environments: Sequence[Environment], *, count: int) -> LightSampl
 
     Returns:
         The samples. If a light has fewer colors than another, its weights for the missing colors are 0.
-
-    Raises:
-        TypeError: `environments` is not a sequence of lights.
-        ValueError: There are no lights, one is a batch, or the count is below 1.
     """
     if not isinstance(environments, Sequence):
         raise TypeError(f"environments must be a list of lights, got one {type(environments).__name__}")
@@ -71,9 +67,6 @@ def natural(*, size: int, degree: int) -> LightSamples:
     Args:
         size: Texels along the edge of a face.
         degree: Highest degree of the harmonics.
-
-    Raises:
-        ValueError: The size is below 1, or the degree is negative.
     """
     direction = np.asarray(cubemap.direction(size=size), np.float64).reshape(-1, 3)
     area = np.asarray(cubemap.solid_angle(size=size), np.float64).reshape(-1, 1)

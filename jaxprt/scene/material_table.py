@@ -464,9 +464,6 @@ def with_materials(
         table: The table.
         materials: The new materials.
         before: Those of the table.
-
-    Raises:
-        ValueError: A material has a normal map, but no material of the table had one.
     """
     if table.frame is None and any(_has_map(material) for material in materials):
         raise ValueError(

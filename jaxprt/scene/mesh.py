@@ -122,11 +122,7 @@ def _check_shapes(mesh: Any) -> None:
 
 
 def check_mesh(value: Any) -> None:
-    """Refuses anything but a mesh.
-
-    Raises:
-        TypeError: The value has not the fields of a mesh.
-    """
+    """Refuses anything but a mesh."""
     if not all(hasattr(value, field) for field in _FIELDS):
         source = "jaxprt.scene.mesh.make_mesh or jaxprt.load_mesh"
         raise TypeError(f"the mesh must be of class Mesh, which {source} makes, got {require.shown(value)}")
@@ -141,11 +137,7 @@ def _check_meshes(value: Any) -> None:
 
 
 def check_kinds(mesh: Any, name: str) -> None:
-    """Refuses a mesh with fields that are not arrays, which only placeholders are.
-
-    Raises:
-        TypeError: There is such a field.
-    """
+    """Refuses a mesh with fields that are not arrays, which only placeholders are."""
     for field in _FIELDS:
         value = getattr(mesh, field)
         if value is not None or field != "texture":
@@ -153,11 +145,7 @@ def check_kinds(mesh: Any, name: str) -> None:
 
 
 def check_values(mesh: Any, name: str) -> None:
-    """Refuses a mesh with values that are not finite, or faces that refer to missing vertices.
-
-    Raises:
-        ValueError: There are such values. Inside `jax.jit` they are not known and not checked.
-    """
+    """Refuses a mesh with values that are not finite, or faces that refer to missing vertices."""
     check_kinds(mesh, name)
     for field in _FIELDS:
         value = getattr(mesh, field)

@@ -53,11 +53,7 @@ class Points(eqx.Module):
         return dataclasses.replace(self, normal=None if normal is None else normal.T)
 
     def check(self, vertices: int) -> None:
-        """Refuses points that refer to missing vertices or lie outside of their triangles; not inside of `jax.jit`.
-
-        Raises:
-            ValueError: A corner is not below the number of vertices, or weights are negative or do not sum to 1.
-        """
+        """Refuses points that refer to missing vertices or lie outside of their triangles; not inside of `jax.jit`."""
         shapes = list(np.shape(self.corner)), list(np.shape(self.weight))
         if len(shapes[0]) != 2 or shapes[0] != shapes[1]:
             raise ValueError(f"points must have corners [k, p] and weights [k, p], got {shapes[0]} and {shapes[1]}")
@@ -115,10 +111,6 @@ def on_triangles(
         face: Triangles of the mesh, `Mesh.face`.
         triangle: Index of each point's triangle.
         barycentric: Barycentric coordinates of each point, which sum to 1.
-
-    Raises:
-        ValueError: A triangle does not exist, or a point lies outside of its triangle. Inside `jax.jit` this is not
-            checked: indices are clamped, and barycentric coordinates are used as they are.
     """
     if np.shape(barycentric) != (*np.shape(triangle), 3) or np.ndim(triangle) != 1:
         shapes = f"{list(np.shape(triangle))} and {list(np.shape(barycentric))}"

@@ -92,11 +92,7 @@ class Part(eqx.Module):
                 raise ValueError(f"part {self.name!r} must have {field} for the textures of its material, got None")
 
     def surface(self) -> MaterialValues:
-        """Material parameters at the vertices.
-
-        Raises:
-            TypeError: The material is a BRDF, which has no textures.
-        """
+        """Material parameters at the vertices."""
         require.kind(f"the material of part {self.name!r}", self.material, TexturedMaterial, source="jaxprt.load_scene")
         assert isinstance(self.material, TexturedMaterial)
         place = self.mesh.texture

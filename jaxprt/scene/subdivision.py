@@ -236,9 +236,6 @@ def subdivide_scene(scene: Scene, divisions: Sequence[Division]) -> Scene:
 
     Parts keep their materials. Vertex colors and second texture coordinates are interpolated. `subdivide` explains what
     happens to the meshes.
-
-    Raises:
-        TypeError: The material of a part has one BRDF for each vertex.
     """
     for part in scene.parts:
         if isinstance(part.material, PerVertex):

@@ -171,9 +171,6 @@ def handedness(mesh: Mesh) -> Float[np.ndarray, " v"]:
     """Handedness of the texture coordinates at each vertex: 1, or -1 where the texture is mirrored.
 
     Where it is -1, the bitangent of the texture is -cross(normal, tangent).
-
-    Raises:
-        ValueError: The mesh has no texture coordinates.
     """
     if mesh.texture is None:
         raise ValueError("the mesh must have texture coordinates, got none: give them to `jaxprt.scene.mesh.make_mesh`")

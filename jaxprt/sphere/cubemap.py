@@ -56,9 +56,6 @@ def point(*, size: int) -> Float[Array, "6 n n 3"]:
 
     Returns:
         Points in the axes of the world, one per texel. They are directions that are not normalized.
-
-    Raises:
-        ValueError: `size` is below 1.
     """
     return _constant(_point(size))
 
@@ -101,9 +98,6 @@ def vector_area(*, size: int) -> Float[Array, "6 n n 3"]:
 
     Returns:
         Vectors in sr, slightly shorter than the solid angle.
-
-    Raises:
-        ValueError: `size` is below 1.
     """
     return _constant(_vector_area(size))
 
@@ -227,9 +221,6 @@ def border_index(*, size: int) -> Int32[np.ndarray, "6 m m"]:
 
     Returns:
         Indices into the 6 size^2 texels in their order, with m = size + 2.
-
-    Raises:
-        ValueError: `size` is below 1.
     """
     return _border_index(size).copy()
 
@@ -259,9 +250,6 @@ def reduced(cubemap: Float[Array, "6 n n c"], *, size: int) -> Float[Array, "6 m
     Args:
         cubemap: Values at texels.
         size: Edge of the faces of the result in texels, a divisor of n.
-
-    Raises:
-        ValueError: `size` is not a divisor of n.
     """
     large = cubemap.shape[1]
     if size < 1 or large % size:
@@ -360,9 +348,6 @@ def coarse(radiance: Float[Array, "6 n n c"], *, edge: int) -> Float[Array, "l c
     Args:
         radiance: Radiance of the fine texels.
         edge: Edge of the coarse faces in texels.
-
-    Raises:
-        ValueError: The edge of the coarse faces does not divide that of the light's.
     """
     size = radiance.shape[1]
     if edge < 1 or size % edge:

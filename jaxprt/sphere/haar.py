@@ -23,10 +23,6 @@ def forward(image: Float[Array, "*b n n c"]) -> Float[Array, "*b n n c"]:
 
     Returns:
         Haar coefficients, in the units of the image.
-
-    Raises:
-        ValueError: The edge is not a power of two.
-
     Reference: Stollnitz, DeRose, Salesin 1995; Wang, Tran, Luebke 2004, section 3.3.
     """
     n = _edge(image.shape)
@@ -79,11 +75,7 @@ def area(*, size: int) -> Float[Array, "n n"]:
 
 
 def face_edge(count: int) -> int:
-    """Edge n of cubemap faces with `count` = 6 n n texels or coefficients.
-
-    Raises:
-        ValueError: `count` is not 6 n n for a power of two n.
-    """
+    """Edge n of cubemap faces with `count` = 6 n n texels or coefficients."""
     n = math.isqrt(max(count, 0) // 6)
     if n < 1 or 6 * n * n != count or n & (n - 1):
         raise ValueError(f"a cubemap must have 6 n n texels with n a power of two, got {count}")

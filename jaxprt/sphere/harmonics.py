@@ -353,10 +353,6 @@ def least_laplacian(coefficient: Float[Array, "lm *c"], share: Float[Array, ""])
     Returns:
         One factor for each band, for `convolve`. All are 1 if the function is constant. Inside `jax.jit`, where `share`
         cannot be checked, a negative share gives NaN.
-
-    Raises:
-        ValueError: `share` is not between 0 and 1.
-
     Reference: Sloan 2008, "Stupid spherical harmonics tricks", section on windowing.
     """
     if not isinstance(share, Tracer) and not 0 <= np.asarray(share) <= 1:

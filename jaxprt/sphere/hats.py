@@ -38,9 +38,6 @@ def integrals(value: Float[Array, "6 n n *c"], *, cells: int) -> Float[Array, "h
 
     Returns:
         Integrals in the units of the function times sr.
-
-    Raises:
-        ValueError: The cells do not divide the texels.
     """
     size, channels = value.shape[1], value.shape[3:]
     profile = jnp.asarray(_profile(size, cells), value.dtype)

@@ -68,9 +68,6 @@ def rotate_each(coefficient: Float[Array, "lm c *v"], rotation: Float[Array, "w 
 
     Returns:
         Rotated coefficients for each rotation.
-
-    Raises:
-        ValueError: The number of rows is not a square, or the counts of functions and rotations differ.
     """
     count = rotation.shape[0]
     if coefficient.ndim == 2:
@@ -95,10 +92,6 @@ def about_z(
         coefficient: SH coefficients in l(l+1)+m order.
         cosine: Cosine of each angle. Its axes broadcast against the last axes of the coefficients.
         sine: Sine of each angle.
-
-    Raises:
-        ValueError: The number of rows is not a square.
-
     Reference: Kautz, Sloan, Snyder 2002, appendix.
     """
     degree = harmonics.degree_of(coefficient.shape[0])

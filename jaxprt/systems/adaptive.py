@@ -69,11 +69,7 @@ def root(size: int) -> int:
 
 
 def value(brdf: Callable, wi: Float[Array, "*b 3"], wo: Float[Array, "... 3"]) -> Float[Array, "*b c"]:
-    """Values of a BRDF for pairs of directions, in 1/sr.
-
-    Raises:
-        ValueError: The BRDF does not return one row for each pair.
-    """
+    """Values of a BRDF for pairs of directions, in 1/sr."""
     wo = jnp.broadcast_to(wo, wi.shape).reshape(-1, 3)
     color = brdf(wi.reshape(-1, 3), wo)
     if jnp.ndim(color) != 2 or color.shape[0] != len(wo):

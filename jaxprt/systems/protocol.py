@@ -134,9 +134,6 @@ class System(eqx.Module):
 
         Args:
             view: The result of `view`, which ideally diffuse systems take for the albedo itself.
-
-        Raises:
-            TypeError: The system has no diffuse response apart from others.
         """
         if not self.matte:
             raise TypeError(f"{type(self).__name__} has no diffuse response apart from others")
@@ -279,19 +276,11 @@ class Exported(eqx.Module):
         return {"lobes": 0, "bands": 0, "words": 0, "steps": 0.0, "knot": knot, "laplacian": 1.0}
 
     def table(self, what: str) -> Float[np.ndarray, "h q e 4"]:
-        """Entries of the BRDF for each knot and view node. `what` names the system in messages.
-
-        Raises:
-            ValueError: The page cannot represent the BRDF.
-        """
+        """Entries of the BRDF for each knot and view node. `what` names the system in messages."""
         return np.ones((1, 1, 1, 4))
 
     def check_table(self, what: str) -> None:
-        """Refuses tables that a page cannot hold.
-
-        Raises:
-            ValueError: The table is anisotropic, or has too many channels, parameters or knots.
-        """
+        """Refuses tables that a page cannot hold."""
         knots = [len(knot) for knot in self.brdf.knot]
         if not self.brdf.isotropic:
             raise ValueError(f"{what} must have an isotropic BRDF to be exported, got an anisotropic one")
@@ -488,22 +477,13 @@ class Total(System):
 
 
 def check_list(points: Any, parts: int) -> None:
-    """Refuses anything but a list with one entry for each part.
-
-    Raises:
-        TypeError: It is not a list, or has another length.
-    """
+    """Refuses anything but a list with one entry for each part."""
     if not isinstance(points, Sequence) or len(points) != parts:
         raise TypeError(f"the points must be a list, one for each of {parts} parts, got {type(points).__name__}")
 
 
 def check_points(points: Any, vertices: Sequence[int]) -> tuple[Points, ...]:
-    """Refuses anything but a list with `Points` for each part; `vertices` are the numbers of vertices of the parts.
-
-    Raises:
-        TypeError: It is not such a list.
-        ValueError: Points do not lie on triangles of their part.
-    """
+    """Refuses anything but a list with `Points` for each part; `vertices` are the numbers of vertices of the parts."""
     check_list(points, len(vertices))
     for of_part, count in zip(points, vertices, strict=True):
         require.kind("the points", of_part, Points, source="jaxprt.scene.points.on_triangles")
@@ -539,10 +519,6 @@ def light_for(taker: Any, value: Any, *, batch: bool = False) -> Environment:
     """`one_light` of a size that a system, or a view, takes by its `light_size` and `light_step`.
 
     What takes lights calls this before anything else: a view may take seconds, and a light that it does not fit none.
-
-    Raises:
-        TypeError: For the reasons of `one_light`.
-        ValueError: For the reasons of `one_light`, or the step does not divide the edge of the faces.
     """
     light = one_light(value, size=taker.light_size, batch=batch)
     if light.radiance.shape[-3] % taker.light_step:

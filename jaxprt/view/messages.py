@@ -114,11 +114,7 @@ def system(message: Mapping[str, Any], systems: Sequence[str]) -> str:
 
 
 def number(message: Mapping[str, Any], name: str, low: float, high: float) -> float:
-    """Reads a finite number from a message.
-
-    Raises:
-        ValueError: The field is not a finite number, or is out of range.
-    """
+    """Reads a finite number from a message."""
     value = message.get(name)
     large = isinstance(value, int) and abs(value) >= _LARGEST_INTEGER  # float() would raise OverflowError
     if isinstance(value, bool) or not isinstance(value, int | float) or large or not math.isfinite(value):
@@ -129,11 +125,7 @@ def number(message: Mapping[str, Any], name: str, low: float, high: float) -> fl
 
 
 def truth(message: Mapping[str, Any], name: str) -> bool:
-    """Reads a field that is true or false; false if it is missing.
-
-    Raises:
-        ValueError: The field is something else.
-    """
+    """Reads a field that is true or false; false if it is missing."""
     value = message.get(name, False)
     if not isinstance(value, bool):
         raise ValueError(f"{name} must be true or false, got {_shorten(value)}")
@@ -164,11 +156,7 @@ def _shorten(value: Any) -> str:
 def numbers(
     message: Mapping[str, Any], name: str, count: int, *, low: float = -1e30, high: float = 1e30
 ) -> tuple[float, ...]:
-    """Reads a list of `count` finite numbers from a message.
-
-    Raises:
-        ValueError: The field has another number of values, or a value is not a finite number in the range.
-    """
+    """Reads a list of `count` finite numbers from a message."""
     value = _items(message, name)
     if len(value) != count:
         raise ValueError(f"{name} must be {count} numbers, got {len(value)}")
@@ -183,11 +171,7 @@ def pack(content: Mapping[str, Any], buffers: Sequence[bytes]) -> bytes:
 
 
 def unpack(data: bytes | bytearray) -> tuple[dict[str, Any], list[bytes]]:
-    """Unpacks bytes from `pack` into the message and its arrays.
-
-    Raises:
-        ValueError: The bytes are not a packed message, or its JSON has numbers that are not finite floats.
-    """
+    """Unpacks bytes from `pack` into the message and its arrays."""
     try:
         (length,) = struct.unpack_from("<I", data)
         if length > _MOST_JSON:

@@ -68,9 +68,6 @@ class Progress:
 
         Args:
             patience: If there is an error, most seconds to wait until a page was told of it.
-
-        Raises:
-            BaseException: The error by which the computation of the scene has ended.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._prepared or self._finished)

@@ -75,11 +75,7 @@ class PageScene:
 
     @classmethod
     def of(cls, relit: RelitScene) -> "PageScene":
-        """All that a page can show of a scene. One warning names the parts that lose a clear coat or a sheen.
-
-        Raises:
-            ValueError: A page cannot show the system of a part.
-        """
+        """All that a page can show of a scene. One warning names the parts that lose a clear coat or a sheen."""
         names = relit.scene.names
         systems = [axes.map_leaves(relit.part_system(n), lambda _, leaf: put(leaf)) for n in range(len(names))]
         parts = [system.exported(f"part {name!r}") for name, system in zip(names, systems, strict=True)]
@@ -104,12 +100,7 @@ class PageScene:
 
     @classmethod
     def for_gpu(cls, relit: RelitScene) -> "PageScene":
-        """All that a page can show of a scene without bounces, as finely as graphics cards hold it.
-
-        Raises:
-            ValueError: A page cannot show the system or the layers of a part, or how lamps light it: by highlights on
-                metals, or through transfer matrices.
-        """
+        """All that a page can show of a scene without bounces, as finely as graphics cards hold it."""
         rows = zip(relit.scene.names, relit.scene.parts, strict=True)
         if relit.lamps is not None and (metals := [name for name, part in rows if _shines(part.material)]):
             raise ValueError(f"lamps shine on these parts by highlights: {', '.join(map(repr, metals))}")

@@ -71,12 +71,7 @@ class Address(NamedTuple):
 
 
 def parse(text: str) -> Address:
-    """Parses an address such as "http://localhost:9000" or "https://hub.example.org/user/me/proxy/8765".
-
-    Raises:
-        TypeError: The address is not text.
-        ValueError: The address has another scheme than http and https, no host, or a user, query or fragment.
-    """
+    """Parses an address such as "http://localhost:9000" or "https://hub.example.org/user/me/proxy/8765"."""
     if not isinstance(text, str):
         raise TypeError(f"the address must be text such as 'http://localhost:9000', got a {type(text).__name__}")
     wrong = ValueError(

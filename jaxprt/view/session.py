@@ -104,11 +104,7 @@ class Session:
 
     @property
     def stages(self) -> Stages:
-        """Lights, materials and views of the scene that is shown.
-
-        Raises:
-            ValueError: There is no scene yet.
-        """
+        """Lights, materials and views of the scene that is shown."""
         return self._shown().stages
 
     @property
@@ -170,10 +166,6 @@ class Session:
             scene: The scene.
             name: Name of the first system that it will have.
             environments: Dictionary from names to lights.
-
-        Raises:
-            TypeError: A light is not an `Environment`.
-            ValueError: There is no light, or the lights have different sizes.
         """
         _check_lights(environments)
         self._replace({name: scene}, environments, preview=True)

@@ -61,11 +61,7 @@ class Stages:
         return self.lights[0].radiance.shape[-2]
 
     def system(self, look: Look) -> RelitScene:
-        """The relit scene of the system that a look names.
-
-        Raises:
-            ValueError: No rays have been traced yet.
-        """
+        """The relit scene of the system that a look names."""
         system = (self.systems if look.bounces else self._bare)[look.system]
         if isinstance(system, Unshadowed):
             raise ValueError("colors must have rays, which are still being traced")
@@ -323,11 +319,7 @@ def freedom(shading: Shading, material: Any) -> dict[str, Any] | None:
 
 
 def change_material(material: Any, name: str, values: Mapping[str, Any]) -> Changeable:
-    """The material with other values of roughness, metallicity, reflectance and colors.
-
-    Raises:
-        ValueError: The material is a BRDF, which cannot change.
-    """
+    """The material with other values of roughness, metallicity, reflectance and colors."""
     if isinstance(material, BlinnPhong):
         new = {key: jnp.asarray(values[key]) for key in ("diffuse", "exponent") if key in values}
         if "f0" in values or "specular" in values:

@@ -27,11 +27,7 @@ class Unshadowed:
 
     @classmethod
     def of(cls, scene: Scene, recipe: Recipe) -> "Unshadowed":
-        """A scene whose parts will be precomputed by one recipe.
-
-        Raises:
-            ValueError: The recipe does not support a part.
-        """
+        """A scene whose parts will be precomputed by one recipe."""
         near = centered(sides.two_sided(scene))
         return cls(near, shaded(near.parts, [recipe] * len(near.parts)))
 

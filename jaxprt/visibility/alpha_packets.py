@@ -38,10 +38,6 @@ class AlphaPackets:
         face: Three vertex indices for each triangle.
         opacity: Opacity of the vertices.
         clear_only: Whether to leave out the opaque triangles, and to keep both sides of sheets, for `layers`.
-
-    Raises:
-        MemoryError: Embree runs out of memory.
-        RuntimeError: embreex ships no library with filter functions, or Embree reports another error.
     """
 
     def __init__(

@@ -187,13 +187,6 @@ def compute(job: Job, run: Run, *, label: str = "precompute") -> dict[str, np.nd
     Returns:
         The result arrays. Arrays with one entry per vertex are cut to the number of vertices. With a path, arrays
         whose first axis is that of the blocks are memory-mapped: pages are read when they are first used.
-
-    Raises:
-        ValueError: The store was made from other inputs.
-        BlockingIOError: Another process is writing to the store.
-        OSError: The disk is full; finished blocks are kept in the store.
-        UnfinishedError: This part is finished, but others are not.
-        RuntimeError: A worker died; finished blocks are kept in the store.
     """
     executor = run.executor
     job = job if run.texels is None else job.with_texels(run.texels)

@@ -189,11 +189,7 @@ class Occluder:
         return partial.passed(origin, direction, point, way)
 
     def from_pixels(self) -> Any:
-        """The Embree scene for rays from the points of pictures.
-
-        Raises:
-            RuntimeError: The Embree library that embreex ships has no packets of rays.
-        """
+        """The Embree scene for rays from the points of pictures."""
         with self._building:
             packed = self._packed if self.opacity is None else self._partial
         if packed is None:

@@ -75,10 +75,6 @@ class Packets:
     Args:
         position: Vertex positions.
         face: Three vertex indices for each triangle.
-
-    Raises:
-        MemoryError: Embree runs out of memory.
-        RuntimeError: Embree reports another error. Check `available` first.
     """
 
     def __init__(self, position: Float32[np.ndarray, "v 3"], face: Integer[np.ndarray, "f 3"]):
@@ -200,10 +196,6 @@ def commit(scene: int, content: str) -> None:
     Args:
         scene: The scene.
         content: What it holds, for error messages.
-
-    Raises:
-        MemoryError: Embree runs out of memory.
-        RuntimeError: Embree reports another error.
     """
     embree = library()
     assert embree is not None

@@ -144,11 +144,7 @@ def exhaustive(
 
 
 def vertex_indices(mesh: Mesh, vertex: np.ndarray | None) -> np.ndarray:
-    """Indices of the vertices to light: all for None, the set entries of a mask, or the given indices.
-
-    Raises:
-        ValueError: `vertex` is neither a mask with one entry per vertex nor an array of vertex indices.
-    """
+    """Indices of the vertices to light: all for None, the set entries of a mask, or the given indices."""
     count = len(mesh.position)
     number = np.arange(count)
     if vertex is None:

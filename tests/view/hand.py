@@ -17,7 +17,7 @@ class Hand:
 
     def __init__(self, browser, url):
         self.page = browser.new_page(viewport={"width": WIDTH, "height": 320})
-        self.page.set_default_timeout(180_000)  # two workers may take all cores, and a picture at rest compiles for 40 s
+        self.page.set_default_timeout(180_000)  # two workers may take all cores; a picture at rest compiles for 40 s
         self.errors = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.goto(url)

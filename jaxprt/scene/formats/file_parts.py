@@ -47,11 +47,6 @@ class TextureImages:
             path: The file.
             channels: Numbers of the channels. Of gray images, each is the gray.
             decoded: Whether integers are decoded from sRGB.
-
-        Raises:
-            FileNotFoundError: The file does not exist.
-            ValueError: It is not a regular file, or damaged.
-            MemoryError: The image does not fit into memory.
         """
         inputs.check(path, "an image file")
         key = path.resolve(), decoded, channels
@@ -76,9 +71,6 @@ def store_channels(image: np.ndarray, channels: tuple[int, ...], name: str) -> j
         channels: Numbers of the channels: 0 to 2 for colors, which are equal in gray images, or 3 alone for alpha,
             which is 1 in images without it.
         name: Name of the image in error messages.
-
-    Raises:
-        MemoryError: The channels do not fit into memory.
     """
     height, width, count = image.shape
     whole = channels == tuple(range(count))
@@ -111,9 +103,6 @@ def materials_of_images(
         plain: The material of regions without an image.
         path: The file, in whose folder the images are.
         outside: Whether images outside of the folder are read.
-
-    Raises:
-        ValueError: An image is outside of the folder.
     """
     materials, ignored, pictures = [], set(content.ignored), TextureImages()
     for name in content.images:

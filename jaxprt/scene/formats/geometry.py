@@ -238,9 +238,6 @@ def check_polygons(polygons: Polygons, vertices: int, name: str) -> None:
         polygons: The polygons.
         vertices: Number of vertices.
         name: Name of the file.
-
-    Raises:
-        ValueError: A vertex does not exist. The message states how many polygons are wrong, and the first one.
     """
     wrong = (polygons.corner < 0) | (polygons.corner >= vertices)
     if wrong.any():

@@ -137,12 +137,7 @@ class MaterialReader:
         self._channels: dict[tuple[int, bool, tuple[int, ...]], jax.Array] = {}
 
     def material(self, index: int | None) -> TexturedMaterial:
-        """The material with an index; for None the default material of the specification.
-
-        Raises:
-            ValueError: A number is not finite or out of range, or an image is outside of the folder of the file.
-            MemoryError: An image does not fit into memory.
-        """
+        """The material with an index; for None the default material of the specification."""
         if index is None:
             return TexturedMaterial(back="hidden")
         owner = f"material {index}"
@@ -352,10 +347,6 @@ def read_lights(
 
     Returns:
         Point lights and spots, suns, and the names of what is not read.
-
-    Raises:
-        ValueError: A light is missing, a number is not finite or negative, the angles of a cone are not ascending from
-            0 to pi / 2, or the node of a spot or a sun has a scale of zero.
     """
     if scale == 0:
         return [], [], set()

@@ -72,9 +72,6 @@ class Header:
         Args:
             path: The file.
             text: The JSON text; a byte order mark is allowed.
-
-        Raises:
-            ValueError: The text is not JSON, holds a name twice in one object, or is not of version 2.
         """
         self.path = path
         self._items: dict[str, list[dict[str, Any]]] = {}
@@ -128,9 +125,6 @@ class Header:
             kind: The kind, such as "meshes".
             value: The index, read from the file and not checked yet.
             owner: The object that refers to it, for error messages.
-
-        Raises:
-            ValueError: There is no object with this index.
         """
         count = len(self.items(kind))
         if not _is_whole(value) or not 0 <= value < count:
@@ -158,11 +152,7 @@ class Header:
         return values
 
     def string(self, item: dict[str, Any], key: str, owner: str) -> str:
-        """A field that is a string.
-
-        Raises:
-            ValueError: It is missing or of another type.
-        """
+        """A field that is a string."""
         return self._field(item, key, owner, str, "a string", None)
 
     def boolean(self, item: dict[str, Any], key: str, owner: str) -> bool:
@@ -170,22 +160,14 @@ class Header:
         return self._field(item, key, owner, bool, "true or false", False)
 
     def integer(self, item: dict[str, Any], key: str, owner: str, default: int | None = None) -> int:
-        """A field that is a whole number and not negative.
-
-        Raises:
-            ValueError: It is of another type, negative, or beyond 2^53; or it is missing and there is no default.
-        """
+        """A field that is a whole number and not negative."""
         value = self._present(item, key, owner) if default is None else item.get(key, default)
         if not _is_whole(value) or not 0 <= value <= _LARGEST:
             raise self.error(f"must have a whole number of at least 0 for {key} of {owner}", excerpt(value))
         return int(value)
 
     def numbers(self, value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-        """Checks one number, or a list of numbers, and converts it to float64.
-
-        Raises:
-            ValueError: The numbers are of another type or count, or not finite in float32.
-        """
+        """Checks one number, or a list of numbers, and converts it to float64."""
         listed = value if shape else [value]
         right = isinstance(listed, list | tuple) and len(listed) == math.prod(shape)
         if not right or not all(type(number) in (int, float) and abs(number) <= LARGEST_FLOAT for number in listed):
@@ -255,11 +237,6 @@ def decode_meshopt(
         extension: The object of EXT_meshopt_compression in the buffer view.
         content: The compressed bytes.
         name: Name of the view, for messages.
-
-    Raises:
-        ImportError: The package meshopt is missing.
-        ValueError: The data are damaged, or their size differs from that of the view.
-        MemoryError: The decoded data do not fit into memory.
     """
     owner = f"{MESHOPT[0]} of {name}" if MESHOPT[0] in view["extensions"] else f"{MESHOPT[1]} of {name}"
     count, stride = (document.integer(extension, key, owner) for key in ("count", "byteStride"))
@@ -312,9 +289,6 @@ def check_required(header: Header, *, geometry: bool) -> None:
     Args:
         header: The file.
         geometry: Whether only the geometry is read, so that extensions of materials, textures and lights do not matter.
-
-    Raises:
-        ValueError: The file requires other extensions. The message names them.
     """
     required = set(header.strings(header.header, "extensionsRequired", "the file"))
     unknown = sorted(name for name in required - HONORED - _HARMLESS if not name.startswith(_LOOK))
@@ -414,10 +388,6 @@ class Document(Header):
             owner: The object that refers to it, for error messages.
             widths: Allowed numbers of components of an element.
             whole: Whether the elements must be integers, such as indices.
-
-        Raises:
-            ValueError: The accessor is missing, damaged, reaches beyond its buffer view, or is of another type; or it
-                has no buffer view and more elements than the file and its buffers have bytes.
         """
         item, name, dtype, count, width, most = self.form(value, owner, *widths, whole=whole)
         if "bufferView" in item:
@@ -450,12 +420,7 @@ class Document(Header):
         return Form(item, name, dtype, count, width, int(np.iinfo(dtype).max) if normalized else 0)
 
     def image(self, value: Any, owner: str) -> bytes:
-        """The bytes of an image, embedded or in a separate file.
-
-        Raises:
-            FileNotFoundError: There is no regular file of its name.
-            ValueError: The image is missing or damaged, or outside of the folder.
-        """
+        """The bytes of an image, embedded or in a separate file."""
         index = self.index("images", value, owner)
         item, name = self.items("images")[index], f"image {index}"
         if "bufferView" in item:

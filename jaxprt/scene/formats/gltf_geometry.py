@@ -67,9 +67,6 @@ def skin_binding(
         sets: Number of sets of joints; 0 gives None.
         used: Indices of the used vertices.
         name: Name of the primitive, for messages.
-
-    Raises:
-        ValueError: A weight is negative or not finite.
     """
     if not sets:
         return None
@@ -85,11 +82,7 @@ def skin_binding(
 
 
 def skin_joints(document: Document, skin: int) -> list[int]:
-    """Indices of the nodes that are the joints of a skin.
-
-    Raises:
-        ValueError: A joint is missing, or there are none.
-    """
+    """Indices of the nodes that are the joints of a skin."""
     item, owner = document.items("skins")[skin], f"skin {skin}"
     named = [document.index("nodes", joint, owner) for joint in document.array(item, "joints", owner)]
     if not named:
@@ -104,9 +97,6 @@ def joint_matrices(document: Document, skin: int, world: dict[int, np.ndarray]) 
         document: The file.
         skin: Index of the skin.
         world: World transforms of nodes by their indices.
-
-    Raises:
-        ValueError: A joint is missing, or there are fewer inverse bind matrices than joints.
     """
     item, owner, named = document.items("skins")[skin], f"skin {skin}", skin_joints(document, skin)
     for joint in named:
@@ -137,9 +127,6 @@ def apply_skin(document: Document, geometry: Geometry, bound: Binding, matrices:
         bound: The joints of its vertices.
         matrices: Transforms of the joints [j 4 4].
         name: Name of the primitive, for messages.
-
-    Raises:
-        ValueError: A vertex refers to a joint that the skin does not have.
     """
     joint, weight = bound
     far = np.flatnonzero((((joint < 0) | (joint >= len(matrices))) & (weight > 0)).any(1))
@@ -178,9 +165,6 @@ def morph_weights(document: Document, node: Node, mesh: int, count: int) -> tupl
         node: The node.
         mesh: Index of its mesh.
         count: Number of targets of the mesh.
-
-    Raises:
-        ValueError: There are more or fewer weights than targets, or they are not finite.
     """
     if not count:
         return ()
@@ -211,9 +195,6 @@ def morph_change(
         used: Indices of the vertices.
         count: Number of vertices of the primitive.
         name: Name of the primitive, for messages.
-
-    Raises:
-        ValueError: The primitive has another number of targets, or a target has other vertices or is not finite.
     """
     if not targets:
         return 0.0
@@ -253,11 +234,6 @@ class DracoReader:
         Args:
             item: The primitive.
             name: Name of the primitive, for messages.
-
-        Raises:
-            ImportError: The package DracoPy is missing.
-            ValueError: The data are damaged, or have other counts than the accessors of the primitive.
-            MemoryError: The decoded data do not fit into memory.
         """
         document = self._document
         extensions = document.object(item, "extensions", name)
@@ -329,11 +305,6 @@ def mesh_counts(content: bytes) -> tuple[int, int]:
 
     Vertices on seams count once, so that a mesh may have more than the header states. The decoder allocates memory by
     these numbers before it can find out that the data are shorter.
-
-    Raises:
-        ValueError: It is not a mesh of version 2.2.
-        IndexError: The data end too early.
-
     Reference: Draco bitstream specification, sections 3 and 4.
     """
     magic, major, minor, kind, method, flags = struct.unpack_from("<5s4BH", content)

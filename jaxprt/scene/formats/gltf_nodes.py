@@ -35,11 +35,7 @@ class Node(NamedTuple):
 
 
 def nodes(document: Document) -> list[Node]:
-    """All nodes of the default scene, parents before their children.
-
-    Raises:
-        ValueError: A node is missing, is reached twice, or has a transform that is not finite.
-    """
+    """All nodes of the default scene, parents before their children."""
     if document.items("scenes"):
         number = document.index("scenes", document.header.get("scene", 0), "the default scene")
         owner = f"scene {number}"
@@ -56,9 +52,6 @@ def joint_transforms(document: Document, scene: Sequence[Node], joints: Iterable
         document: The file.
         scene: The nodes of the default scene.
         joints: Indices of the joints.
-
-    Raises:
-        ValueError: A joint or its ancestor has several parents, or a transform that is not finite.
     """
     matrices = {node.number: node.matrix for node in scene}
     outside = [joint for joint in dict.fromkeys(joints) if joint not in matrices]
@@ -97,11 +90,7 @@ def _parents(document: Document) -> dict[int, list[int]]:
 
 
 def instance_count(document: Document, node: Node) -> int:
-    """How often a node repeats its mesh: once, or as often as EXT_mesh_gpu_instancing says.
-
-    Raises:
-        ValueError: The attributes of the instances have different counts, or there are none.
-    """
+    """How often a node repeats its mesh: once, or as often as EXT_mesh_gpu_instancing says."""
     attributes = _instance_attributes(document, node)
     if attributes is None:
         return 1
@@ -115,11 +104,7 @@ def instance_count(document: Document, node: Node) -> int:
 
 
 def instances(document: Document, node: Node) -> np.ndarray:
-    """World transforms of the instances of a node's mesh [n 4 4].
-
-    Raises:
-        ValueError: The counts of attributes differ, or a number is not finite, or a rotation is zero.
-    """
+    """World transforms of the instances of a node's mesh [n 4 4]."""
     count, attributes, owner = (
         instance_count(document, node),
         _instance_attributes(document, node),
@@ -296,10 +281,6 @@ def pose(document: Document, time: float, animation: str | int | None) -> set[st
 
     Returns:
         Names of features of the animation that are not read.
-
-    Raises:
-        ValueError: The file has no such animation, or it is damaged: times that are not in ascending order, values
-            that are missing or not finite, a node with a matrix.
     """
     index = _animation_index(document, animation)
     owner = f"animation {index}"

@@ -28,9 +28,6 @@ def read_off(path: pathlib.Path) -> MeshContent:
 
     Args:
         path: The file.
-
-    Raises:
-        ValueError: The file is damaged, binary, or not of three dimensions. The message names the file.
     """
     content = re.sub(rb"#[^\n]*", b"", text.read(path, "an undamaged OFF file"))
     try:
@@ -108,9 +105,6 @@ def read_stl(path: pathlib.Path) -> MeshContent:
 
     Args:
         path: The file.
-
-    Raises:
-        ValueError: The file is damaged. The message names the file.
     """
     content = inputs.content(path, "a mesh file")
     try:

@@ -91,11 +91,7 @@ _SILENT |= {"prb_projective", "independent", "multijitter", "orthogonal", "strat
 
 
 def rgb(value: Any, name: str) -> np.ndarray:
-    """A color [3] from a number, three numbers, or a dictionary of type rgb, srgb, uniform or spectrum.
-
-    Raises:
-        ValueError: The value has another form or is not finite.
-    """
+    """A color [3] from a number, three numbers, or a dictionary of type rgb, srgb, uniform or spectrum."""
     if isinstance(value, Mapping):
         inner = value.get("value", value.get("color"))
         if value.get("type") not in ("rgb", "srgb", "uniform", "spectrum") or isinstance(inner, Mapping | str):
@@ -174,11 +170,7 @@ class MaterialMaker:
         return kind in _MAKERS | _WRAPPERS | {"bitmap", "rgb", "ref"}
 
     def of_shape(self, name: str, item: Mapping[str, Any]) -> TexturedMaterial:
-        """The material of a shape, including its emission. Without a BSDF it is Mitsuba's default gray of 0.5.
-
-        Raises:
-            ValueError: The BSDF has an unsupported type, or a reference is missing.
-        """
+        """The material of a shape, including its emission. Without a BSDF it is Mitsuba's default gray of 0.5."""
         emitted, fields = [], []
         for key, plugin in self.plugins(item, name).items():
             if plugin["type"] == "area":
@@ -198,9 +190,6 @@ class MaterialMaker:
         """Plugins that a plugin holds. Records its parameters that are not read, unless they are zero.
 
         `kind` is the entry of the table of parameters, if it is not the type.
-
-        Raises:
-            ValueError: A name that is not in the table has no plugin where only a plugin can have one, or no numbers.
         """
         kind, result = kind or item["type"], {}
         for key, value in item.items():
@@ -411,11 +400,7 @@ def read(scene: Mapping[str, Any]) -> Scene:
 
 
 def transform(value: Any, name: str, *, sizes: tuple[int, ...] = (4,)) -> np.ndarray:
-    """A transform, [4 4] or of another size, from an array, lists or an object with a `matrix`; the identity for None.
-
-    Raises:
-        ValueError: The value has another form, is not finite, or is a projection.
-    """
+    """A transform, [4 4] or of another size, from an array, lists or an object with a `matrix`; None: the identity."""
     if value is None:
         return np.eye(4)
     matrix = _array(getattr(value, "matrix", value))

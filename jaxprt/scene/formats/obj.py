@@ -366,9 +366,6 @@ def materials_of_regions(
         plain: Material of faces without one.
         unread: What of the geometry is not read, for the warning.
         outside: Whether MTL files and images may be outside of the folder of the OBJ file.
-
-    Raises:
-        ValueError: An MTL file or an image is outside of the folder, whether it exists or not.
     """
     source = content(path)
     order, files = used_materials(source)
@@ -447,9 +444,6 @@ def read_mtl(
 
     Returns:
         Materials by name; and names of unsupported statements and of missing or damaged images.
-
-    Raises:
-        ValueError: A number is damaged or out of range, or an image is outside of the folder. The message states where.
     """
     ignored: set[str] = set()
     named: dict[str, dict[str, list[str]]] = {}

@@ -95,11 +95,7 @@ Columns = dict[str, np.ndarray | Lists]
 
 
 def read_header(content: bytes) -> PlyHeader:
-    """Reads the header.
-
-    Raises:
-        ValueError: The header is damaged, or counts more rows than the file has bytes for.
-    """
+    """Reads the header."""
     start = re.match(rb"ply[ \t]*(\r\n|\n|\r)", content)
     if not start:
         raise ValueError(f"it must start with a line 'ply', got {content[:8]!r}")
@@ -170,9 +166,6 @@ def read_elements(content: bytes, header: PlyHeader, names: set[str], lists: set
         header: The header of the file.
         names: Names of the elements.
         lists: Names of the properties whose lists are read. Other lists have their lengths, but no items.
-
-    Raises:
-        ValueError: A row is damaged or missing.
     """
     tables: dict[str, Columns] = {}
     rows = text.rows(content[header.end :].replace(b"\r\n", b"\n").replace(b"\r", b"\n")) if not header.order else None

@@ -111,9 +111,6 @@ def numbers(words: Words, *, kind: type = float) -> np.ndarray:
     Args:
         words: The words.
         kind: float or int. Integers beyond 64 bits become the nearest one.
-
-    Raises:
-        RowError: A word is not a number.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # older NumPy only warns of words that are not numbers
@@ -250,9 +247,6 @@ def whole_lists(value: np.ndarray, length: np.ndarray, what: str) -> np.ndarray:
         value: All items, one list after the other.
         length: The length of each list.
         what: Name of the rows for messages, such as "face".
-
-    Raises:
-        ValueError: An item has a fraction. The message states its row.
     """
     wrong = np.flatnonzero(has_fraction(value))
     if wrong.size:

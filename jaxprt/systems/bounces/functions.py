@@ -135,10 +135,6 @@ def basis(brdf: SeparableBrdf) -> SeparableBrdf:
     """The path functions f_p of a factored BRDF, as the colors of another one.
 
     There are as many as its colors need: one if all are multiples of one color.
-
-    Raises:
-        ValueError: The light maps of the BRDF differ by color.
-
     Reference: Sun et al. 2007, section 3.1.
     """
     view = jnp.matmul(brdf.view_map, fixed_weights(brdf).T, precision="highest")
@@ -176,11 +172,7 @@ def albedo(basis: SeparableBrdf) -> Float[Array, " p"]:
 
 
 def fixed_weights(brdf: SeparableBrdf) -> Float[Array, "p c"]:
-    """Weights of the functions of one BRDF that cannot change. They are orthonormal, and as few as its colors need.
-
-    Raises:
-        ValueError: The light maps of the BRDF differ by color.
-    """
+    """Weights of the functions of one BRDF that cannot change. They are orthonormal, and as few as its colors need."""
     if brdf.light_map.shape[-1] != 1:
         raise ValueError(
             f"light maps must have one channel that all colors share, got {brdf.light_map.shape[-1]} channels"

@@ -134,13 +134,7 @@ class LitTransfer(eqx.Module):
 
 
 def light_side(tensor: TransferTensor, light: Environment) -> LitTransfer:
-    """Applies the tensor to a light: everything that depends on the light only.
-
-    Raises:
-        TypeError: `light` is not an `Environment`.
-        ValueError: The light is a batch or not finite, or the edge of its faces is not a multiple of that of the
-            tensor's.
-    """
+    """Applies the tensor to a light: everything that depends on the light only."""
     return _lit(tensor, protocol.one_light(light).radiance)
 
 

@@ -50,9 +50,6 @@ def reflect(brdfs: Sequence[Callable], lobe: LobeBrdf | None, *, resolution: int
         brdfs: BRDFs (wi, wo) -> value [*b c] in 1/sr on local directions, all with the same number of colors.
         lobe: Lobes of the BRDFs, one table along the index of the BRDF; None to subtract nothing.
         resolution: Edge of the map of views in texels.
-
-    Raises:
-        ValueError: A BRDF is negative or not finite.
     """
     direction = jnp.asarray(np.asarray(hemisphere.parabolic_texel_direction(resolution=resolution)).reshape(-1, 3))
     area = jnp.asarray(np.asarray(hemisphere.parabolic_texel_area(resolution=resolution)).ravel())

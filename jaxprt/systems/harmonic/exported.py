@@ -24,12 +24,7 @@ class ExportedMatrices(Exported):
 
     @classmethod
     def of(cls, what: str, system: Any) -> "ExportedMatrices":
-        """What a page holds of a `HarmonicSystem`. `what` names it in messages.
-
-        Raises:
-            ValueError: The matrices are not gray, or do not come from a visibility, for example because they include
-                interreflection.
-        """
+        """What a page holds of a `HarmonicSystem`. `what` names it in messages."""
         transport = system.transport
         if transport.matrix.shape[1] != 1:
             raise ValueError(
@@ -79,9 +74,6 @@ class ExportedMatrices(Exported):
         A BRDF that is symmetric about the plane of the view direction and the normal can be written, in each band, as a
         sum of zonal harmonics about directions in this plane. Its dot product with the light is then the sum of the
         light's bands, evaluated in these directions, times the entries. The page therefore does not rotate harmonics.
-
-        Raises:
-            ValueError: The table is too large for a page, or the BRDF is anisotropic or not symmetric.
         """
         self.check_table(what)
         brdf = self.brdf

@@ -338,10 +338,6 @@ def blended_view(
         frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
         materials: Weights and parameters of each vertex; None for the table's own channels as colors.
         eye: Position of the viewer in world units: one, or one for each vertex.
-
-    Raises:
-        TypeError: The materials are not a `Blend`.
-        ValueError: The blend has another number of vertices or channels.
     """
     protocol.check_blend(materials)
     eye = require.position("the eye", eye, points=len(position))

@@ -92,9 +92,6 @@ class HarmonicBrdf(eqx.Module):
         Args:
             wo: Unit directions to the viewer in the local frame.
             parameter: Values of each BRDF parameter for these views.
-
-        Raises:
-            ValueError: The number of parameters differs from the table's.
         """
         if len(parameter) != len(self.knot):
             needed = f"{len(self.knot)} parameters, got {len(parameter)}"

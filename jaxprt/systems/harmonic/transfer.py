@@ -172,9 +172,6 @@ def visible(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *, degree: 
         seen: Visible share of each cubemap texel in sixteenths.
         frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
         degree: Highest degree of the harmonics. Transfer matrices need twice their own degree.
-
-    Raises:
-        ValueError: d is not 6 n n for a power of two n.
     """
     flux = _flux(seen, frame)
     clear = seen.astype(frame.dtype) / visibility.LEVELS
@@ -232,10 +229,6 @@ def transfer_diffuse(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"], *,
         seen: Visible share of each cubemap texel in sixteenths.
         frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
         degree: Highest degree of the harmonics.
-
-    Raises:
-        ValueError: d is not 6 n n for a power of two n.
-
     Reference: Sloan, Kautz, Snyder 2002, section 4.
     """
     size = haar.face_edge(seen.shape[1])
@@ -306,9 +299,6 @@ def check_memory(vertices: int, degree: int, *, copies: int = 1, colors: int = 1
         colors: Number of colors of each matrix.
         in_files: Whether the matrices stay in memory-mapped files. On a CPU, too little memory then causes a warning
             instead of the error.
-
-    Raises:
-        MemoryError: The matrices do not fit.
     """
     size = 4 * (degree + 1) ** 4 * colors
     require.memory(

@@ -28,9 +28,6 @@ def places(lamps: Sequence[Mesh | PointLight], power: Float[np.ndarray, " n"], *
         power: The power of each lamp, in any unit. Stronger lamps get more rays, if there are many.
         pieces: Number of pieces into which each surface is cut: 1, 4 or 16. Surfaces that turn to all sides have twice
             as many, up to 16.
-
-    Raises:
-        ValueError: A surface has no area, or its positions are not finite.
     """
     rows, first, count, cut, sides, total = [], [], [], [], [], 0
     for lamp in lamps:

@@ -171,9 +171,6 @@ def sample_surface(lamp: Mesh, *, count: int) -> tuple[Float[np.ndarray, "s 3"],
     Args:
         lamp: The surface. It emits on the side to which its vertex normals point.
         count: Number of points.
-
-    Raises:
-        ValueError: The surface has no area, or its positions are not finite.
     """
     visibility.occluder.check(lamp, "lamp")
     corner, normal = (np.asarray(row, np.float64)[np.asarray(lamp.face)] for row in (lamp.position, lamp.normal))

@@ -57,9 +57,6 @@ def prefilter(light: Environment) -> LobeLight:
 
     Args:
         light: One environment.
-
-    Raises:
-        ValueError: The light is a batch, its faces have an edge of less than 8 texels, or it is not finite.
     """
     if light.radiance.shape[1] < 8:
         raise ValueError(

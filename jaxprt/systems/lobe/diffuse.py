@@ -48,9 +48,6 @@ def vectors(seen: UInt8[Array, "b d"], frame: Float[Array, "b 3 3"]) -> UInt8[Ar
     Args:
         seen: Visible share of each cubemap texel in sixteenths.
         frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
-
-    Raises:
-        ValueError: d is not 6 n n for a power of two n.
     """
     size = haar.face_edge(seen.shape[1])
     mean = cubemap.vector_area(size=size) / cubemap.solid_angle(size=size)[..., None]

@@ -82,11 +82,7 @@ class ExportedLobes(Exported):
         return super().description | lobe_description(self.brdf)
 
     def table(self, what: str) -> Float[np.ndarray, "h q e 4"]:
-        """For each knot and view node: mean, log concentration and weights of each lobe, and albedos.
-
-        Raises:
-            ValueError: The table is anisotropic, or too large for a page.
-        """
+        """For each knot and view node: mean, log concentration and weights of each lobe, and albedos."""
         self.check_table(what)
         return lobe_entries(self.brdf)
 

@@ -209,11 +209,6 @@ def view_lobes(
         points: Points at which radiance is evaluated; None for the vertices.
         variance: Variance in squared radians, along one axis, by which the lobes of each vertex or point are widened;
             None for zero.
-
-    Raises:
-        TypeError: The BRDF is not a `LobeBrdf`.
-        ValueError: The number of parameters differs from the table's, or the eye is not finite, or is neither one
-            position nor one for each vertex or point.
     """
     eye = require.position("the eye", eye, points=len(transport.position if points is None else points))
     return _view_lobes(transport, brdf, parameter, eye, points, variance)

@@ -286,11 +286,7 @@ def _check_options(lobes: int | None, error: float | None, resolution: int) -> N
 
 
 def brdf_samples(brdf: Callable, *, resolution: int) -> tuple[Float[Array, "*q 3"], tuple[Array, ...]]:
-    """Views at the nodes of a table, and samples of a BRDF for each; see `jaxprt.systems.lobe.em.samples`.
-
-    Raises:
-        ValueError: The BRDF returns values that are negative or not finite, or have no color axis.
-    """
+    """Views at the nodes of a table, and samples of a BRDF for each; see `jaxprt.systems.lobe.em.samples`."""
     brdf = grid.as_argument(brdf)
     return _samples(brdf, resolution, is_isotropic(brdf), ())
 

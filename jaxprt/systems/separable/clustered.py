@@ -106,9 +106,6 @@ class ClusteredTransport(eqx.Module):
 
         Returns:
             The light-modulated tuple of Wang et al., in units of radiance.
-
-        Raises:
-            ValueError: The light has another number of coefficients than the transport.
         """
         require.length("the light's coefficients", coefficient, self.rms.shape[0])
         return linear(_relit, _transpose, self, coefficient)

@@ -114,9 +114,6 @@ def check_mark(known: Array | None, light_map: Array, *, name: str = "the BRDF")
         known: Samples of the transport's light factors, from `mark_of`, or None.
         light_map: Light maps of the BRDF, for all terms of the transport or the first ones.
         name: Name of the BRDF in the error message.
-
-    Raises:
-        ValueError: The light factors differ.
     """
     if known is None or isinstance(known, Tracer) or isinstance(light_map, Tracer) or len(light_map) > len(known):
         return

@@ -109,9 +109,6 @@ class SparseTransport(eqx.Module):
 
         Returns:
             The light-modulated tuple of Wang et al., in units of radiance.
-
-        Raises:
-            ValueError: The light has another number of coefficients than the transport.
         """
         require.length("the light's coefficients", coefficient, self.rms.shape[0])
         colors = max(coefficient.shape[1], self.value.shape[3])
@@ -175,9 +172,6 @@ def largest(
 
     Returns:
         Indices along d, as uint16 if they fit and else uint32, and values.
-
-    Raises:
-        ValueError: `keep` is below 1 or above the number of coefficients.
     """
     count = coefficient.shape[1]
     if not 1 <= keep <= count:

@@ -123,9 +123,6 @@ def light_tuple(transport: Transport, light: Environment) -> Float[Array, "v r c
 
     Returns:
         One value per vertex, term and color, with vertices in the order of the mesh.
-
-    Raises:
-        ValueError: The light is a batch, has another cubemap size than the transport, or is not finite.
     """
     require.kind("the light", light, Environment, source="jaxprt.scene.load_environment")
     return transport.apply(project(protocol.one_light(light, size=haar.face_edge(transport.rms.shape[0]))))
@@ -141,11 +138,6 @@ def view_tuple(
         position: Positions in world units.
         frame: Shading frames; rows are tangent, bitangent, normal.
         eye: Position of the viewer in world units: one, or one for each position.
-
-    Raises:
-        ValueError: The eye is not finite, or is neither one position nor one for each. Inside `jax.jit`, where values
-            are not known, NaN in the eye reaches all vertices.
-
     Reference: Wang, Tran, Luebke 2004, sections 3.1 and 3.4.
     """
     eye = require.position("the eye", eye, points=len(position))

@@ -147,11 +147,7 @@ class StandardTable:
         return "path.view" in self._stored
 
     def paths(self) -> tuple[SeparableBrdf, FunctionWeights]:
-        """The functions with which parts send light to others, and their weights over roughness.
-
-        Raises:
-            ValueError: The file holds none; see `has_paths`.
-        """
+        """The functions with which parts send light to others, and their weights over roughness."""
         if not self.has_paths:
             raise ValueError(f"no functions of light paths are shipped for {self.name}")
         return _paths(self, _dtype())
