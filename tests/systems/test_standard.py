@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.standard import descent, fit
 from jaxprt import Blend, bright_texels, harmonic, lobe
 from jaxprt.brdf import MetallicRoughness
 from jaxprt.relit import curvature, paths
@@ -18,7 +19,7 @@ from jaxprt.systems import bounces, standard
 from jaxprt.systems.bounces import traced
 from jaxprt.systems.harmonic import HarmonicSystem
 from jaxprt.systems.lobe import LobeSystem
-from jaxprt.systems.standard import BLINN_PHONG, COOK_TORRANCE, METALLIC_ROUGHNESS, SHEEN, descent, fit
+from jaxprt.systems.standard import BLINN_PHONG, COOK_TORRANCE, METALLIC_ROUGHNESS, SHEEN
 
 BOTH = pytest.mark.parametrize("table", [METALLIC_ROUGHNESS, BLINN_PHONG, COOK_TORRANCE], ids=lambda table: table.name)
 EVERY = pytest.mark.parametrize(

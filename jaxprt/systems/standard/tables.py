@@ -1,6 +1,6 @@
 """Tables of metallic-roughness, Blinn-Phong and Cook-Torrance materials and of sheens over roughness, shipped.
 
-Each material has one file. `jaxprt.systems.standard.fit` writes it. Reading runs on the host: it compiles no program.
+Each material has one file. `benchmarks.standard.fit` writes it. Reading runs on the host: it compiles no program.
 Numbers are stored in half precision, directions in 16-bit fixed point.
 """
 

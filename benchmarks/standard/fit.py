@@ -1,6 +1,6 @@
 """Fits the tables that are shipped, and writes their files.
 
-    python -m jaxprt.systems.standard.fit [--lobes 12 ...] [--only lobes|harmonics|...] [MATERIAL ...]
+    python -m benchmarks.standard.fit [--lobes 12 ...] [--only lobes|harmonics|...] [MATERIAL ...]
 
 What is not fitted anew stays in the file as it is. Lobes are fitted by EM jointly over roughness and view, and improved
 by descent at roughnesses whose lobes are wide enough for its quadrature. Errors are those of the rounded numbers.
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from benchmarks.standard import descent
 from jaxprt.brdf import MetallicRoughness, sheen
 from jaxprt.brdf.varying import Channels
 from jaxprt.sphere import hemisphere
@@ -23,7 +24,7 @@ from jaxprt.systems import bounces, bright_texels, dynamic, harmonic, lobe
 from jaxprt.systems.bounces import traced
 from jaxprt.systems.lobe import LobeBrdf, em
 from jaxprt.systems.lobe.table import brdf_samples, measured_error
-from jaxprt.systems.standard import descent, tables
+from jaxprt.systems.standard import tables
 from jaxprt.systems.standard.families import RoughnessFamily, SheenFamily, ShininessFamily, SlopeFamily
 
 COUNTS = (4, 8, 12, 24)  # numbers of lobes; others are fitted by who asks for them
