@@ -30,6 +30,14 @@ def browser():
         made.close()
 
 
+@pytest.fixture
+def second(browser):
+    """Another browser, in processes of its own."""
+    made = browser.browser_type.launch(executable_path=CHROMIUM, args=SWITCHES)
+    yield made
+    made.close()
+
+
 @pytest.fixture(scope="session")
 def systems():
     """A glossy ball over a matte plane, by lobes with a bounce, and by harmonics."""

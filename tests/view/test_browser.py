@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxprt as prt
+from benchmarks.endurance import growth, held
 from jaxprt import files, image
 from jaxprt.image import tonemap
 from jaxprt.scene import Camera, Environment
@@ -310,6 +311,42 @@ def test_a_server_that_was_killed_is_told_and_the_viewer_goes_on_when_it_is_back
     assert not hand.errors
     hand.page.close()
     back.close()
+
+
+@pytest.mark.long
+def test_five_hundred_looks_of_two_browsers_end_right_and_leave_little_behind(browser, second, systems, lights):
+    server = Server(Session(systems, environments=lights))
+    hands, random, counts = [Hand(each, server.url) for each in (browser, second)], np.random.default_rng(0), []
+    for number in range(500):
+        hand = hands[number % 2]
+        way = (np.array([150, 150]) + random.uniform(-30, 30, 2)).tolist()
+        hand.drag((150, 150), way) if number % 5 else hand.page.keyboard.press("]")
+        hand.settle()
+        if number % 25 == 0:  # a tab that asks and is gone
+            gone = browser.new_page()
+            gone.goto(server.url, wait_until="commit")
+            gone.close()
+        if number % 100 == 51:
+            hand.page.context.set_offline(True)
+            hand.page.mouse.move(150, 150)
+            hand.page.mouse.down()
+            hand.page.mouse.move(160, 150)
+            hand.page.mouse.up()
+            hand.page.wait_for_function(f"() => {TOLD}.includes('no answer from Python')")
+            hand.page.context.set_offline(False)
+            hand.page.wait_for_function(f"() => {TOLD} === ''")
+        counts.append(held())
+    assert (more := growth(counts))["more_files"] <= 2, more
+    assert more["more_mappings"] < 500, more
+    assert more["more_bytes"] < 1e8, more
+    for hand in hands:
+        hand.drag((150, 150), (160, 150))
+        hand.still()
+        off = np.abs(hand.pixels() - drawn(hand, systems, lights)).max(-1)
+        assert np.quantile(off, 0.997) < 2.5 / 255
+        assert not hand.errors
+        hand.page.close()
+    server.close()
 
 
 @pytest.mark.parametrize(("factor", "stops"), [(1.0, 0.0), (2.0**8, -8.0), (2.0**-8, 8.0)])
