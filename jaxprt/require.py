@@ -54,10 +54,7 @@ def unreal(value: Any) -> str:
 
 
 def _array_of(value: Any) -> Any:
-    """Converts a value to an array of NumPy, or of JAX for lists of values inside `jax.jit`; None if it cannot.
-
-    Arrays stay as they are.
-    """
+    """Converts a value to an array of NumPy, or of JAX for lists of values inside `jax.jit`; None if it cannot."""
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         return value
     for convert in (np.asarray, jnp.asarray):  # NumPy cannot convert lists of values inside `jax.jit`.

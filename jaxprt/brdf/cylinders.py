@@ -54,16 +54,7 @@ def _overlap(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Arra
 
 
 def _reflect(brdf, wi: Array, wo: Array, arc: Callable, plane: Callable) -> Array:
-    """The BRDF as a mean over one period.
-
-    Args:
-        brdf: One of the two models.
-        wi: Directions to the light.
-        wo: Directions to the viewer.
-        arc: Function from theta to the interval of normal angles that a direction sees of one arc.
-        plane: Function from theta to the interval of y that it sees of the plane between two arcs, whose axes are at 0
-            and `distance`.
-    """
+    """The BRDF as a mean over one period; `arc` and `plane` give the intervals that a direction theta sees."""
     lit = (wi[..., 2] > 0) & (wo[..., 2] > 0)
     least = jnp.asarray([-2, -2, _GRAZING], wi.dtype)
     wi, wo = (jnp.maximum(jnp.where(lit[..., None], w, jnp.asarray([0, 0, 1], w.dtype)), least) for w in (wi, wo))
@@ -81,6 +72,7 @@ def _reflect(brdf, wi: Array, wo: Array, arc: Callable, plane: Callable) -> Arra
         # cos^n(x). Using 1 - cos(x) = 2 sin^2(x / 2) avoids the cancellation that a large n would amplify.
         return jnp.exp(n * jnp.log1p(-jnp.minimum(2 * jnp.sin(angle / 2) ** 2, 1 - _GRAZING)))
 
+    # `arc` gives normal angles seen of an arc, `plane` y of the plane between two arcs with axes at 0 and `distance`.
     limits = _overlap(arc(theta_i), arc(theta_o))
     angle, weight = _nodes(*limits, _DIFFUSE_NODES)
     diffuse = jnp.sum(weight * facing(angle), -1) / (cos_i * cos_o)

@@ -48,11 +48,9 @@ def _polar_angles(wi: Array, wo: Array) -> tuple[Array, Array]:
 
 
 def _turn(wi: Array, wo: Array) -> Array:
-    """phi_d. Exchanging the directions adds pi. It is zero, with zero gradient, where it is undefined.
-
-    In the frame that is rotated with the half vector, wi - wo is along
-    (-(wi - wo).n, n.(wi x wo) (-2) / |wi + wo|) up to a positive factor.
-    """
+    """phi_d. Exchanging the directions adds pi. It is zero, with zero gradient, where it is undefined."""
+    # In the frame that is rotated with the half vector, wi - wo is along, up to a positive factor,
+    # (-(wi - wo).n, n.(wi x wo) (-2) / |wi + wo|).
     x = wo[..., 2] - wi[..., 2]
     y = 2 * (wi[..., 1] * wo[..., 0] - wi[..., 0] * wo[..., 1]) / jnp.maximum(_norm(wi + wo), 1e-6)
     pole = x**2 + y**2 < _TINY

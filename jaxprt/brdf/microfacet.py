@@ -46,10 +46,8 @@ def _alpha(roughness: Array) -> Array:
 
 
 def _lobe(wi: Array, wo: Array, along: Array, across: Array, rotation: Array | float) -> tuple[Array, Array]:
-    """D V, [*b 1], for alpha along a tangent axis and across it, and the cosine between half vector and directions.
-
-    It is computed component by component, for the same reason as `half_vector`.
-    """
+    """D V, [*b 1], for alpha along a tangent axis and across it, and the cosine between half vector and directions."""
+    # Computed component by component, for the same reason as `half_vector`.
     (x, y, z), cos_d, cos_i, cos_o = half_vector(wi, wo)
     cosine, sine = jnp.cos(rotation), jnp.sin(rotation)
 

@@ -200,11 +200,7 @@ def _inputs(chosen: SimpleNamespace) -> tuple[dict[str, Path], dict[str, Environ
 
 
 def _check_settings(chosen: SimpleNamespace, lights: list[str]) -> None:
-    """Writes what determines the pictures of a folder, or compares it with that of the pictures that are there.
-
-    Raises:
-        ValueError: They differ.
-    """
+    """Writes what determines the pictures of a folder, or refuses a folder whose pictures have other settings."""
     skipped = {"files", "lights", "output", "as_json", "outside"}
     settings = {name: _text(value) for name, value in vars(chosen).items() if name not in skipped}
     settings |= {"lights": lights, "jaxprt": importlib.metadata.version("jaxprt")}
@@ -237,16 +233,9 @@ def _lines(path: Path) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class _Light:
-    """A light of a scene.
+    """A light of a scene: the environment `source`, rotated by `turn` degrees about the vertical."""
 
-    Attributes:
-        name: Name in the names of files.
-        source: Name of the environment.
-        turn: Angle in degrees by which it is rotated about the vertical.
-        environment: The rotated light.
-    """
-
-    name: str
+    name: str  # in the names of files
     source: str
     turn: float
     environment: Environment
@@ -307,16 +296,14 @@ def _render_scene(
 def _measured(
     relit: RelitScene, lights: list[_Light], cameras: list[Camera], folder: Path
 ) -> dict[str, dict[str, float]]:
-    """For each light, the error of direct light in one view, and the exposure of pictures; measured once.
-
-    The exposure is the least of some views: views of the lit side would be white at that of the dark side.
-    """
+    """For each light, the error of direct light in one view, and the exposure of pictures; measured once."""
     path = folder / _SCENE
     if path.exists():
         return json.loads(path.read_text())
     direct, environments = relit.without_bounces(), [light.environment for light in lights]
     middle = cameras[len(cameras) // 2]
     truth = exact_pixels(direct.scene, direct.shading, environments, middle, pixels=_PIXELS)
+    # The exposure is the least of some views: views of the lit side would be white at that of the dark side.
     some = cameras[:: -(-len(cameras) // _EXPOSED)]
     stops = np.full(len(lights), np.inf)
     for block in relit.picture_blocks(environments, some, memory=_MEMORY):

@@ -43,11 +43,8 @@ def bisect(point: Float[np.ndarray, "v f"], *, clusters: int) -> Int[np.ndarray,
 
 
 def _order(along: Float[np.ndarray, " v"]) -> Int[np.ndarray, " v"]:
-    """Indices of points in ascending order. Points with equal coordinates are ordered by index.
-
-    Symmetric meshes have many equal coordinates. Their order must not depend on rounding, which differs between
-    processors.
-    """
+    """Indices of points in ascending order. Points with equal coordinates are ordered by index."""
     order = np.argsort(along, kind="stable")
+    # Symmetric meshes have many equal coordinates, whose order must not depend on rounding: processors differ in it.
     rises = np.diff(along[order], prepend=along[order[0]]) > _TIE * np.ptp(along)
     return order[np.lexsort((order, np.cumsum(rises)))]

@@ -390,10 +390,8 @@ def _stored_header(path: Path) -> dict[str, Any]:
 
 
 def _check_files(path: Path, name: str) -> None:
-    """Refuses links, which may lead out of the folder, and pipes, which would block.
-
-    Files are also written, so a link in a folder from a stranger could replace other files of the user.
-    """
+    """Refuses links, which may lead out of the folder, and pipes, which would block."""
+    # Files are also written, so a link in a folder from a stranger could replace other files of the user.
     what = "a part of a store of arrays"
     inputs.check_unlinked(path / name, what)
     for lock in path.glob(".lock.*"):

@@ -404,16 +404,14 @@ def _read_components(content: bytes, header: _Header, name: str) -> Float32[np.n
 
 
 def _read_pixels(content: bytes, header: _Header, name: str) -> Float32[np.ndarray, "h w 3"]:
-    """Reads flat pixels, and those of the old run-length coding: 1, 1, 1, n repeats the pixel before n times.
-
-    Consecutive repetitions have the digits of n to the base 256, the lowest first. No run crosses a scan line.
-    """
+    """Reads flat pixels, and those of the old run-length coding: 1, 1, 1, n repeats the pixel before n times."""
     count = header.length * header.width
     stored = len(content) - header.start
     unit = np.frombuffer(content, np.uint8, stored // 4 * 4, header.start).reshape(-1, 4)
     marker = (unit[:, 0] == 1) & (unit[:, 1] == 1) & (unit[:, 2] == 1)
     if marker.any():
         pixels.check_memory(name, header.length, header.width, 3, decoder=40 * len(unit) + 4 * count)
+        # Consecutive repetitions have the digits of n to the base 256, the lowest first. No run crosses a scan line.
         expanded = _expand(unit, marker, header)
         # In a flat file a dark pixel of a careless writer may look like a run.
         whole = expanded is not None or stored == 4 * count

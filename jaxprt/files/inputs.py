@@ -168,14 +168,12 @@ def reference(name: str, base: pathlib.Path, *, folder: pathlib.Path, owner: str
 
 
 def _other_spelling(path: pathlib.Path, folder: pathlib.Path) -> pathlib.Path | None:
-    """The path in a folder that differs from another in case and Unicode form alone; None unless there is one.
-
-    Folders outside are not searched: what a link to one leads to keeps its spelling.
-    """
+    """The path in a folder that differs from another in case and Unicode form alone; None unless there is one."""
     try:
         here = home = folder.resolve()
         parts = path.resolve().relative_to(home).parts
         for number, part in enumerate(parts):
+            # Folders outside are not searched: what a link to one leads to keeps its spelling.
             if not here.resolve().is_relative_to(home):
                 return here.joinpath(*parts[number:])
             if not os.path.lexists(here / part):

@@ -228,11 +228,7 @@ class _KnownError(Exception):
 
 
 class _Reader:
-    """Makes the object that a description states. Whatever does not have the form that `save` writes is refused.
-
-    Attributes:
-        value: The object.
-    """
+    """Makes `value`, the object that a description states. Refuses what does not have the form that `save` writes."""
 
     def __init__(self, path: Path, content: Any):
         self._path = path

@@ -349,12 +349,10 @@ def png_damage(content: bytes, name: str) -> str:
 
 
 def _needed_chunks(content: bytes) -> tuple[dict[bytes, bytes], str]:
-    """The chunks without which a PNG file cannot be read, those of one kind joined; and what is wrong with them.
-
-    libpng reads on to the end of the file after the pixels only where they are interlaced.
-    """
+    """The chunks without which a PNG file cannot be read, those of one kind joined; and what is wrong with them."""
     chunk: dict[bytes, bytes] = {}
     place, pixels = 8, []
+    # libpng reads on to the end of the file after the pixels only where they are interlaced.
     while not pixels or content[place + 4 : place + 8] == b"IDAT" or chunk[b"IHDR"][12:] == b"\1":
         size, kind = int.from_bytes(content[place : place + 4], "big"), content[place + 4 : place + 8]
         body, end = content[place + 8 : place + 8 + size], place + 12 + size

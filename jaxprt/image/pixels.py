@@ -265,17 +265,14 @@ def _concatenate(parts: list[tuple[Array, ...]]) -> list[Any]:
 
 @jit
 def _uniform(fragments: Fragments, facing: Bool[Array, " f"], uneven: Bool[Array, " f"]):
-    """Masks of pixels with one triangle and of pixels with several points, and each pixel's background fraction.
-
-    The first sample that sees a surface represents it: its member mask has a bit for each sample of that surface, and
-    the masks of the other samples are empty. So far only the pixels that show one triangle have masks.
-    """
+    """Member masks of pixels with one triangle, a mask of pixels with several points, and background fractions."""
     height, width, *_ = fragments.triangle.shape
     triangle = fragments.triangle.reshape(height * width, -1).T
     shown = facing[triangle] & (triangle >= 0)
     same = functools.reduce(jnp.logical_and, [sample == triangle[0] for sample in triangle])
     same &= ~uneven[triangle[0]] | (len(triangle) == 1)
     mixed = ~same & functools.reduce(jnp.logical_or, list(shown))
+    # A surface's first sample represents it: its mask has a bit for each sample of the surface, other masks are empty.
     whole = jnp.where(same & shown[0], (1 << len(triangle)) - 1, 0).astype(jnp.uint8)
     members = jnp.pad(whole[:, None], ((0, 0), (0, len(triangle) - 1)))
     empty = functools.reduce(jnp.add, [(sample < 0).astype(fragments.depth.dtype) for sample in triangle])
@@ -290,14 +287,12 @@ def _project(mesh: Mesh, camera: Camera) -> Float[Array, "3 v"]:
 
 @jit
 def _faces(mesh: Mesh, projected: Float[Array, "3 v"]):
-    """Region and normal of each triangle, and the change of 1 / depth per pixel to the right and down.
-
-    1 / depth is linear in the image plane of a triangle. The normal is the sum of the vertex normals.
-    """
+    """Region and normal of each triangle, and the change of 1 / depth per pixel to the right and down."""
     face = mesh.face.T
     normal = jax.lax.map(lambda axis: axis[face], jax.lax.stop_gradient(mesh.normal.T))
     x, y, q = jax.lax.map(lambda axis: axis[face], projected)
     s = jnp.sign(q)
+    # 1 / depth is linear in the image plane of a triangle.
     value, right, down = _affine(x - s * s[0] * x[0], y - s * s[0] * y[0], q)
     area = sum(value[i] * s[i] for i in range(3))
     scale = [jnp.where(area == 0, 0, jnp.abs(component) / jnp.where(area == 0, 1, area)) for component in q]
@@ -316,16 +311,14 @@ def _samples(row: Int[Array, " m"], fragments: Fragments, face: tuple[Array, ...
 
 @jit
 def _same(samples: tuple[Array, ...]) -> dict[tuple[int, int], Bool[Array, " m"]]:
-    """Whether two samples see the same surface, for each pair (i, j) of the samples of a pixel with i < j.
-
-    Where two triangles meet between the samples, the inverse depth changes by a mean of the two triangles' slopes.
-    """
+    """Whether two samples see the same surface, for each pair (i, j) of the samples of a pixel with i < j."""
     triangle, inverse, region, x, y, z, right, down, uneven = samples
     offset = SAMPLES[len(triangle)]
     same = {}
     for j in range(len(triangle)):
         for i in range(j):
             step = [(offset[j] - offset[i]) @ jnp.stack([right[k], down[k]]) for k in (i, j)]
+            # Where two triangles meet between the samples, 1 / depth changes by a mean of the two triangles' slopes.
             jump = jnp.abs(inverse[j] - inverse[i] - (step[0] + step[1]) / 2)
             near = jump <= (jnp.abs(step[0]) + jnp.abs(step[1])) / 2 + SAME_DEPTH * inverse[i]
             dot, *square = (x[a] * x[b] + y[a] * y[b] + z[a] * z[b] for a, b in ((i, j), (i, i), (j, j)))
@@ -357,12 +350,7 @@ def _points(
     face: Int[Array, "f 3"],
     projected: Float[Array, "3 v"],
 ):
-    """Shading points of the surfaces that some samples represent.
-
-    Returns:
-        Triangles, pixels and coverage; the projected vertices relative to the sample, and the offset from the sample to
-        the mean position of the surface's samples.
-    """
+    """Shading points of the surfaces that samples represent; vertices and mean positions are relative to the sample."""
     height, width, *_ = fragments.depth.shape
     samples, dtype = members.shape[1], projected.dtype
     used, sample = sample >= 0, jnp.maximum(sample, 0)
@@ -539,11 +527,7 @@ def _hidden_now(mesh: Mesh, camera: Camera, hidden: Any) -> Any:
 def _slots(
     mesh: Mesh, camera: Camera, samples: int, hidden: Any, occluder: Occluder
 ) -> list[tuple[Int[np.ndarray, "h w s"], Float[np.ndarray, "h w s"], Float[np.ndarray, "h w s *c"]]]:
-    """The surfaces that samples see, from front to back: triangles, depths, and the share that each sample sees.
-
-    Shares are those of each color if there is colored glass. Where a sample has no more surfaces, the triangle is -1
-    and the share that of the background.
-    """
+    """Triangles, depths and shares of the surfaces that samples see, from front to back; triangle -1 is background."""
     if not known(camera, mesh):
         raise ValueError(
             "pictures of surfaces with holes or translucent ones need concrete values, but the camera or the scene is "
@@ -555,7 +539,7 @@ def _slots(
     layer = np.asarray(occluder.opacity.layer)[occluder.face[:, 0]]
     clear[:count] = layer > 0
     passing, glass = np.asarray(occluder.opacity.passing), np.asarray(occluder.opacity.glass)
-    passing = passing[layer, : 1 if np.all(passing == 1) else 3]
+    passing = passing[layer, : 1 if np.all(passing == 1) else 3]  # shares are by color if there is colored glass
     away = np.zeros(len(mesh.face), bool) if hidden is None else _hidden_now(mesh, camera, hidden)
     opaque = dataclasses.replace(mesh, face=np.where((clear | away)[:, None], 0, np.asarray(mesh.face)))
     base = raster.rasterize(opaque, camera, samples=samples)
@@ -586,18 +570,9 @@ def _gray(share: Float[np.ndarray, "h w s *c"]) -> Float[np.ndarray, "h w s"]:
 
 
 def _chunk(count, face, place, cover, through, triangle, depth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles, depths and shares [k, n, c] of the surfaces on some rays, with those behind all layers.
-
-    Args:
-        count: Number of translucent layers on each ray.
-        face: Triangle of each layer.
-        place: Distance of each layer along the view axis.
-        cover: Share of a view of each layer that shows the layer itself.
-        through: Share that shows what is behind the layer, for each color.
-        triangle: The opaque triangle behind the layers of each ray; -1 for none.
-        depth: Distance of that triangle along the view axis.
-    """
+    """Triangles, depths and shares [k, n, c] of the surfaces on some rays, with those behind all layers."""
     listed = np.arange(face.shape[1]) < count[:, None]
+    # `cover` is the share of a view of a layer that shows the layer itself, `through` what is behind, for each color.
     left = np.cumprod(np.where(listed[..., None], through, 1), 1)
     before = np.concatenate([np.ones_like(left[:, :1]), left[:, :-1]], 1)
     rows, ends = np.arange(len(count)), count.copy()

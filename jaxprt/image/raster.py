@@ -273,13 +273,7 @@ def project(position: Float[Array, "v 3"], camera: Camera) -> tuple[Float[Array,
 
 
 def _determinants(x, y, q, column, row):
-    """Twice the signed areas of a pixel and the edge opposite each vertex, and their signs.
-
-    Each is the difference of two products. The neighboring triangle traverses the edge in the opposite direction and
-    computes the same products in exchanged order. The sign comes from comparing the products, so that contraction to a
-    fused multiply-add cannot change it. A tie is broken as if the pixel were moved to the right by an infinitesimal
-    amount, and down by a much smaller one.
-    """
+    """Twice the signed areas of a pixel and the edge opposite each vertex, and their signs."""
     s = [jnp.sign(q[i]) for i in range(3)]
     a = [x[i] - s[i] * column for i in range(3)]
     b = [y[i] - s[i] * row for i in range(3)]
@@ -288,8 +282,10 @@ def _determinants(x, y, q, column, row):
         left, right = a[i] * b[j], a[j] * b[i]
         along_x, against_x = y[i] * s[j], y[j] * s[i]
         along_y, against_y = x[j] * s[i], x[i] * s[j]
+        # A tie is broken as if the pixel were moved right by an infinitesimal amount, and down by a much smaller one.
         tie = (along_x > against_x) | ((along_x == against_x) & (along_y > against_y))
         value.append(left - right)
+        # Comparing the products, rather than subtracting, gives signs that fused multiply-adds cannot change.
         positive.append((left > right) | ((left == right) & tie))
     return value, positive
 
@@ -316,10 +312,7 @@ def _cover(x, y, q, column, row):
 
 
 def _bounds(x, y, q, height: int, width: int, shift: float):
-    """First column, first row, and numbers of columns and rows of the pixels that triangles may cover.
-
-    Samples lie up to `shift` from the center of their pixel.
-    """
+    """First column, first row, and numbers of columns and rows of the pixels that triangles may cover."""
     s = jnp.sign(q)
     ahead = (q[0] > 0) & (q[1] > 0) & (q[2] > 0)
     drawn = (q[0] > 0) | (q[1] > 0) | (q[2] > 0)
@@ -331,6 +324,7 @@ def _bounds(x, y, q, height: int, width: int, shift: float):
         outside = jnp.maximum(jnp.maximum(left[0], left[1]), left[2]) < 0
         outside |= jnp.minimum(jnp.minimum(right[0], right[1]), right[2]) > 0
         middle = (size - 1) / 2
+        # Samples lie up to `shift` from the center of their pixel.
         first = jnp.where(ahead, jnp.clip(jnp.ceil(low + (middle - shift)), 0, size), 0).astype(jnp.int32)
         last = jnp.where(ahead, jnp.clip(jnp.floor(high + (middle + shift)), -1, size - 1), size - 1).astype(jnp.int32)
         finite = jnp.isfinite(low) & jnp.isfinite(high)
@@ -342,12 +336,9 @@ def _bounds(x, y, q, height: int, width: int, shift: float):
 
 
 def _nearest(x, y, q, height: int, width: int, samples: int) -> tuple[Float[Array, "h w s"], Int[Array, "h w s"]]:
-    """Depth and index of the nearest triangle at every sample.
-
-    Samples are drawn as the pixels, here called cells, of a picture of higher resolution. Triangles that face the
-    camera are drawn first. The other triangles are drawn next, except those that are clearly hidden by then.
-    """
+    """Depth and index of the nearest triangle at every sample. Triangles that face the camera are drawn first."""
     fine = math.isqrt(samples)
+    # Samples are drawn as the pixels, here called cells, of a picture of higher resolution.
     x, y = fine * x, fine * y
     bounds = _bounds(x, y, q, fine * height, fine * width, SHIFT if fine > 1 else 0.0)
     some = (bounds[2] > 0) & (bounds[3] > 0)
@@ -366,10 +357,8 @@ def _nearest(x, y, q, height: int, width: int, samples: int) -> tuple[Float[Arra
 
 
 def _hidden_triangles(depth: Float[Array, "h w"], q, bounds, tile: int) -> Bool[Array, " f"]:
-    """Triangles that lie behind everything drawn on the tiles that they touch. Large triangles are not tested.
-
-    A tile's edge has TILE cells, which are `tile` pixels.
-    """
+    """Triangles that lie behind everything drawn on the tiles that they touch. Large triangles are not tested."""
+    # A tile's edge has TILE cells, which are `tile` pixels.
     column, row, columns, rows = bounds
     height, width = depth.shape
     padded = jnp.pad(depth, ((0, -height % tile), (0, -width % tile)))
@@ -386,12 +375,7 @@ def _hidden_triangles(depth: Float[Array, "h w"], q, bounds, tile: int) -> Bool[
 
 
 def _draw(nearest: Narrow | Wide, drawn: Bool[Array, " f"], x, y, q, bounds, width: int, fine: int):
-    """Draws some of the triangles into a depth buffer.
-
-    Each triangle's bounding box is divided into patches. The patches of all triangles are drawn in order, one chunk at
-    a
-    time: a step considers as many triangles as a chunk has patches, and draws the first of their remaining patches.
-    """
+    """Draws some triangles into a depth buffer, by patches of their bounding boxes, in order, one chunk at a time."""
     faces, patch = q.shape[1], PATCH[fine]
     chunk = nearest.chunk(faces)
     height = len(jax.tree.leaves(nearest)[0]) // width
@@ -403,6 +387,7 @@ def _draw(nearest: Narrow | Wide, drawn: Bool[Array, " f"], x, y, q, bounds, wid
 
     def step(state):
         start, done, nearest = state
+        # A step considers as many triangles as a chunk has patches, and draws the first of their remaining patches.
         t = jax.lax.dynamic_slice(number, (start,), (chunk,))
         across = jax.lax.div(columns[t] + (patch - 1), jnp.int32(patch))
         count = jnp.where(start + slot < rank[-1], across * jax.lax.div(rows[t] + (patch - 1), jnp.int32(patch)), 0)
@@ -440,12 +425,10 @@ def _draw(nearest: Narrow | Wide, drawn: Bool[Array, " f"], x, y, q, bounds, wid
 
 
 def _running_sum(count: Int[Array, " n"] | Bool[Array, " n"]) -> Int[Array, " n"]:
-    """Inclusive prefix sums of counts by products with triangular matrices, which are faster than XLA's on the CPU.
-
-    Sums are exact to 2^24. Larger sums may be rounded or too small, but stay above 2^24.
-    """
+    """Inclusive prefix sums of counts by products with triangular matrices, which are faster than XLA's on the CPU."""
     n = count.shape[0]
     block = jnp.pad(count.astype(jnp.float32), (0, -n % 128)).reshape(-1, 128)
+    # Sums are exact to 2^24. Larger sums may be rounded or too small, but stay above 2^24.
     total = jnp.matmul(block, jnp.triu(jnp.ones((128, 128), jnp.float32)))
     total = jnp.minimum(total, 2.0**29).astype(jnp.int32)  # the sum of two still fits in an int32
     if n > 128:

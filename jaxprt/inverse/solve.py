@@ -185,20 +185,16 @@ def _determined_directions(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _scores(axis: np.ndarray, value: np.ndarray, rows: np.ndarray, left: np.ndarray) -> np.ndarray:
-    """Standard error of the solution along each direction, by leaving out blocks of neighboring pixels.
-
-    Noise is independent from pixel to pixel and averages out. The residual of a wrong model is correlated between
-    neighboring pixels and averages out between blocks at best.
-
-    Each block moves the directions by (S^2 - J_b^T J_b)^-1 J_b^T r_b when it is left out, with singular values S.
-
-    Reference: Efron 1982, the jackknife; Bell and McCaffrey 2002 for clusters that the fit has partly followed.
-    """
+    """Standard error of the solution along each direction, by leaving out blocks of neighboring pixels."""
+    # Noise averages out between pixels. The residual of a wrong model is correlated between neighbors, and averages out
+    # between blocks at best.
     along, count = axis.T @ rows, min(_BLOCKS, len(left))
     whole, blocks = np.diag(value**2), []
     for part in np.array_split(np.arange(len(left)), count):
         local = along[:, part]
         without = whole * (1 + _ROUNDED) - local @ local.T  # Never singular, also where one block determines all.
+        # The block moves the directions by (S^2 - J_b^T J_b)^-1 J_b^T r_b, with singular values S, when it is left out:
+        # the jackknife of Efron 1982; Bell and McCaffrey 2002 for clusters that the fit has partly followed.
         blocks.append(np.linalg.solve(without, local @ left[part]))
     moved = np.stack(blocks, 1) * np.sqrt((count - 1) / count)
     least = np.linalg.norm(left) / np.sqrt(max(1, len(left) - len(value))) / value  # of independent noise
@@ -267,11 +263,9 @@ def _jaxopt() -> Any:
 
 @functools.cache
 def _marquardt_steps() -> tuple[Callable, Callable, Callable]:
-    """Programs for the first state, the next state and one step of jaxopt's Levenberg-Marquardt method.
-
-    Residual and Jacobian are arguments of these programs, so that fits of the same shapes share them.
-    """
+    """Programs for the first state, the next state and one step of jaxopt's Levenberg-Marquardt method."""
     solver = _jaxopt().LevenbergMarquardt(
+        # Residual and Jacobian are arguments of these programs, so that fits of the same shapes share them.
         lambda u, residual, jac: residual,
         materialize_jac=True,
         solver="cholesky",

@@ -207,12 +207,7 @@ def forget() -> None:
 
 
 class _Compiled:
-    """Counts the programs that this process compiles or loads.
-
-    Attributes:
-        programs: Their number.
-        counted: Their number when mappings were counted last.
-    """
+    """Counts the programs that this process compiles or loads; `counted` are those when mappings were counted last."""
 
     def __init__(self) -> None:
         self.programs = self.counted = 0

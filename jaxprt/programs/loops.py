@@ -72,13 +72,7 @@ def describe(loop: Any) -> str:
 
 
 def _texts(value: Any, names: Sequence[str], seen: set) -> Iterator[str]:
-    """Texts of a value.
-
-    Args:
-        value: A function, or what it reads from outside.
-        names: Names in the code that reads it: of its attributes, if it is a module.
-        seen: Functions that have been described, and modules with names in them.
-    """
+    """Texts of a function or of what it reads from outside, such as the attributes `names` of a module."""
     if value is None or value is ... or isinstance(value, bool | int | float | complex | str | bytes):
         yield repr(value)
     elif isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:

@@ -169,13 +169,11 @@ def _open_file(path: str, flags: int) -> int:
 
 
 def _make_folder(folder: pathlib.Path) -> bool:
-    """Creates the folder if it is absent, and says whether it can be trusted.
-
-    It is created in a folder of the user, or where everybody may create folders, as in /tmp.
-    """
+    """Creates the folder if it is absent, and says whether it can be trusted."""
     if not os.path.lexists(folder):
         parent = next(parent for parent in folder.parents if os.path.lexists(parent))
         status = parent.stat()
+        # It is created in a folder of the user, or where everybody may create folders, as in /tmp.
         if not (_is_owner(status) or status.st_mode & stat.S_ISVTX):  # for example a folder of the user who called sudo
             return False
         if fault := _fault(parent, private=False):
@@ -194,29 +192,20 @@ def _is_trusted(folder: pathlib.Path) -> bool:
 
 
 def _fault(folder: pathlib.Path, *, private: bool = True) -> str:
-    """Why another user may decide what is in a folder; empty if only root and the user may.
-
-    It goes down from the root. Nobody else can replace an entry of a folder that has passed, nor one of root or the
-    user in a folder like /tmp. Therefore nothing that has passed can change before a file is opened. Links count where
-    nobody else can create any, but the last two folders must be none.
-
-    Args:
-        folder: An absolute path.
-        private: Whether the last two folders are jaxprt's own.
-
-    Raises:
-        OSError: The folder does not exist.
-    """
+    """Why another user may decide what is in a folder; empty if only root and the user may."""
     if not folder.is_absolute() or not stat.S_ISDIR(folder.stat().st_mode):
         return f"{folder} is not the absolute path of a folder"
     if os.name != "posix":
         return ""
     path, rest, shared = pathlib.Path(), list(reversed(folder.parts)), False
+    # From the root down: nobody else can replace an entry of a folder that has passed, nor one of root or the user in a
+    # folder like /tmp. Therefore nothing that has passed can change before a file is opened.
     while rest:
         path /= rest.pop()
         status, last = path.lstat(), private and not rest
         if not (_is_owner(status) or (status.st_uid == 0 and not last)):
             return f"{path} belongs to another user"
+        # Links count where nobody else can create any; the last two folders, jaxprt's own if `private`, must be none.
         if stat.S_ISLNK(status.st_mode):
             if shared or (private and len(rest) < 2):
                 return f"{path} is a symbolic link"

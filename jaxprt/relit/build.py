@@ -177,21 +177,12 @@ def _warn(scene: Scene, near: Scene, shadings: Sequence[Shading], recipes: Seque
 
 @dataclasses.dataclass(frozen=True)
 class _Traced:
-    """Direct light of a scene.
+    """Direct light of a scene: the system of each group, and the emitting parts and point lights, if there are any."""
 
-    Attributes:
-        scene: The scene, with the materials that its systems show.
-        near: The scene with its origin at zero.
-        shadings: Mesh, BRDF and weights of each part.
-        place: Where the vertices of the parts stand in the groups.
-        systems: The system of each group.
-        lamps: Emitting parts and point lights; None without.
-    """
-
-    scene: Scene
-    near: Scene
+    scene: Scene  # with the materials that its systems show
+    near: Scene  # the scene with its origin at zero
     shadings: list[Shading]
-    place: groups.Place
+    place: groups.Place  # where the vertices of the parts stand in the groups
     systems: list[System]
     lamps: lamps.SceneLamps | None
 
@@ -338,9 +329,6 @@ def _recipe(system, name: str, scene: Scene) -> Recipe:
 
 
 def _file_name(parts: Sequence[int], scene: Scene) -> str:
-    """A name for the files of a group: at most 40 letters and digits of its first part's name.
-
-    A key of the indices of the parts follows where there are several.
-    """
+    """A name for a group's files: up to 40 letters and digits of its first part's name, and a key of several parts."""
     name = "".join(letter if letter.isalnum() else "_" for letter in scene.parts[parts[0]].name)[:40]
     return f"{parts[0]}_{name}" + (f"_{fingerprint(np.asarray(parts))[:8]}" if len(parts) > 1 else "")

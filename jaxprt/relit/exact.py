@@ -263,19 +263,12 @@ def _sum(
 
 
 class _PicturePoints(NamedTuple):
-    """What a picture shows.
-
-    Attributes:
-        pixels: Its points.
-        owner: Index of the part of each point; -1 in padding.
-        face: Triangles of the mesh of all parts.
-        first: Index of the first vertex of each part.
-    """
+    """What a picture shows: its points, the part of each, and the triangles of the mesh of all parts."""
 
     pixels: Pixels
-    owner: Int[np.ndarray, " p"]
+    owner: Int[np.ndarray, " p"]  # index of the part of each point; -1 in padding
     face: Int[np.ndarray, "f 3"]
-    first: Int[np.ndarray, " n"]
+    first: Int[np.ndarray, " n"]  # index of the first vertex of each part
 
     @classmethod
     def of(cls, scene: Scene, camera: Camera) -> "_PicturePoints":
@@ -305,12 +298,9 @@ def _choose_places(covered: np.ndarray, count: int) -> np.ndarray:
 
 
 def _halves(row: Int[np.ndarray, " m"], place: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
-    """Divides the points of each row into two halves, along the diagonals of the pixel.
-
-    Both halves have the same mean place, so that a linear change of radiance across the pixel is not taken for an
-    error.
-    """
+    """Divides the points of each row into two halves, along the diagonals of the pixel."""
     half = _SIDE // 2
+    # Both halves have the same mean place: a linear change of radiance across the pixel is not taken for an error.
     side = (place // _SIDE // half + place % _SIDE // half) % 2
     apart = np.bincount(row, side) * np.bincount(row, 1 - side) > 0
     return np.where(apart[row], side, (np.arange(len(row)) - np.searchsorted(row, row)) % 2)

@@ -377,21 +377,13 @@ def _colors_of_row(
     apart: bool,
     recompute: bool,
 ) -> list[tuple[Float[Array, "*m p c"], ...]]:
-    """Colors of the points of a row under each light.
-
-    Args:
-        picture: The picture.
-        row: The points.
-        lights: What arrives at them.
-        lamps: The lamps, if rays are traced to them.
-        apart: Whether to give colors of direct light also.
-        recompute: Whether derivatives compute again what depends on the view, which needs less memory.
-    """
+    """Colors of the points of a row under each light; also of direct light if `apart`."""
     surface = sampled(picture.stage.surfaces[row.number], row.samples)
     if row.index.ndim == 2:  # of a view that was made inside of `jax.jit`
         return [_colors_of_some(picture, row, light, apart=apart) for light in lights]
     if isinstance(row.viewed, Viewed):
         return [_lit(surface, row, row.index, row.viewed, light, apart=apart) for light in lights]
+    # With `recompute`, derivatives compute again what depends on the view, which needs less memory.
     shade = partial(_shaded, picture, surface, row, row.index, lamps, apart)
     return (jax.checkpoint(shade) if recompute else shade)(lights)
 

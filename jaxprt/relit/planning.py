@@ -221,14 +221,8 @@ def key_of(scene: Scene, environments: Sequence[Environment]) -> str:
 
 
 def _candidates(sample: Sample, alone: Sample | None, run: Run, error: float, seconds: float):
-    """Measures candidates of each system: a bisection along its steps, to the first that meets the error.
-
-    `alone` is the sample with a BRDF that can be factored; None for groups without such a BRDF.
-
-    Some steps are skipped: those with more bytes than a candidate that already meets the error (twice as many if that
-    candidate is too slow); those close to a step that misses the error by far; and those of a system whose smallest
-    step would save less than a tenth of the bytes.
-    """
+    """Measures candidates of each system: a bisection along its steps, to the first that meets the error."""
+    # `alone` is the sample with a BRDF that can be factored; None for groups without such a BRDF.
     ladders = [_ladder(recipe, sample, alone) for recipe in registry.systems().values()]
     most = math.inf  # largest number of bytes that is worth measuring
     for ladder in filter(None, ladders):

@@ -102,19 +102,16 @@ def make(
 
 
 def _regions(place: Place, typical: Sequence[Array | None]) -> tuple[Int[np.ndarray, " n"], list[list[int]]]:
-    """The region of the transfer tensor to which each part belongs, and the parts of each region.
-
-    The parts of a region send light to other surfaces with one mean material. A group whose material cannot change is
-    one region. In other groups each part has a region of its own, unless there are too many; then the parts with the
-    most similar weights share one, by Ward's clustering.
-    """
+    """Each part's region of the transfer tensor, and each region's parts, which send light with one mean material."""
     region = np.full(len(place.counts), -1, np.int32)
     for parts in map(list, place.parts):
         label = np.arange(len(parts))
         most = -(-_REGIONS * len(parts) // len(region))
+        # A group whose material cannot change is one region.
         if typical[parts[0]] is None:
             label = np.zeros_like(label)
         elif most < len(parts):
+            # Too many for regions of their own: parts with the most similar weights share one, by Ward's clustering.
             rows = _stacked([typical[part] for part in parts]).reshape(len(parts), -1)
             label = scipy.cluster.hierarchy.fcluster(scipy.cluster.hierarchy.ward(rows), most, "maxclust") - 1
         region[parts] = np.max(region) + 1 + label

@@ -196,11 +196,7 @@ def _exact(
     environments: Sequence[Environment],
     views: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Which points face each view, their radiance [light, view, point, color], and the error of `visible`.
-
-    The error is the relative L2 difference between radiance with the visibility `visible` and radiance with rays traced
-    from the points, under the worst light.
-    """
+    """Which points face each view, their radiance [light, view, point, color], and the error of `visible`."""
     position, frame = placed(mesh.position, jnp.asarray(frames(mesh.normal, mesh.tangent)), points)
     toward = views[:, None] - np.asarray(position)
     facing = np.einsum("vi,wvi->wv", np.asarray(frame)[:, 2], toward) > 0
@@ -216,6 +212,7 @@ def _exact(
 
     exact, true = radiance(visible), radiance(traced)
     require.finite("the radiance that the BRDF reflects, by light, view, point and color,", exact)
+    # Relative L2 between radiance with `visible` and with rays traced from the points, under the worst light.
     return facing, exact, max(relative_error(a[facing], b[facing]) for a, b in zip(exact, true, strict=True))
 
 

@@ -290,13 +290,11 @@ class RelitScene(System):
         return batches.radiance(self.surfaces, self.bounces, lights, blends, lamp, view, self._order())
 
     def _points(self, number: int, stage: Stage) -> tuple[Points, Points | None]:
-        """The vertices of a group as points of the scene; or the scene's points on it, and these on the group.
-
-        In scenes with normal maps, vertices are points on the group too, which have the normals of these maps.
-        """
+        """The vertices of a group as points of the scene; or the scene's points on it, and these on the group."""
         points, place = self._untilted(number)
         if stage.table.frame is None:
             return points, place
+        # In scenes with normal maps, vertices are points on the group too, which have the normals of these maps.
         if place is None:
             place = material_table.at_vertices(np.arange(len(points), dtype=np.int32))
         return points, place.tilted(groups.look_at(stage.table, stage.rough, points).normal)

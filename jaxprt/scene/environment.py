@@ -41,17 +41,8 @@ _PARTS_AT_ONCE = 2**20  # parts of pixels per step
 
 
 def _resampling_bytes(shape: tuple[int, ...], size: int, *, faces_down: int | None, around: int) -> int:
-    """Memory that resampling takes besides the picture, and the light in float32 that is made of the result.
-
-    Args:
-        shape: Rows, columns and channels of the picture.
-        size: Texels along the edge of a cube face.
-        faces_down: Faces of a cube layout from top to bottom; None for latlong pictures.
-        around: Smallest number of parts around the horizon.
-
-    Returns:
-        An upper bound in bytes.
-    """
+    """Upper bound in bytes of what resampling takes besides the picture, and of the light in float32 of the result."""
+    # `faces_down`: faces of a cube layout from top to bottom. `around`: smallest number of parts around the horizon.
     height, width, channels = shape
     texels = 6 * size**2
     # The mean radiance and two temporary arrays of one channel in float64, and the light in float32.
@@ -63,31 +54,14 @@ def _resampling_bytes(shape: tuple[int, ...], size: int, *, faces_down: int | No
 
 
 def _box_edges(count: int, *, on_edge: bool) -> np.ndarray:
-    """Edges of the boxes around equidistant samples on [-1, 1].
-
-    Args:
-        count: Number of samples.
-        on_edge: Whether the outer samples are at the ends, where their boxes are half as large.
-
-    Returns:
-        The edges, ascending, one more than samples.
-    """
+    """Ascending edges of the boxes around equidistant samples on [-1, 1]; half boxes at the ends if `on_edge`."""
     if not on_edge or count == 1:
         return np.linspace(-1, 1, count + 1)
     return np.clip((2 * np.arange(count + 1) - 1) / (count - 1) - 1, -1, 1)
 
 
 def _means_of_cube(face: np.ndarray, edge: np.ndarray, size: int) -> Float64[np.ndarray, "6 n n c"]:
-    """Exact area means of a cube: pixels, texels and their overlaps are all rectangles on a face.
-
-    Args:
-        face: Pixels of the six faces, [6, m, m, c], in OpenGL's orientation.
-        edge: Edges of the pixels on [-1, 1], the same for rows and columns.
-        size: Texels along the edge of a face.
-
-    Returns:
-        Mean radiance of each texel.
-    """
+    """Exact area means of a cube [6, m, m, c]: pixels, texels and their overlaps are all rectangles on a face."""
     texel_edge = np.linspace(-1, 1, size + 1)
     cut = np.union1d(edge, texel_edge)
     pixel = np.searchsorted(edge, (cut[1:] + cut[:-1]) / 2) - 1
@@ -108,18 +82,7 @@ def _means_of_cube(face: np.ndarray, edge: np.ndarray, size: int) -> Float64[np.
 def _means_of_latlong(
     image: np.ndarray, latitude: np.ndarray, longitude: np.ndarray, size: int, *, around: int
 ) -> Float64[np.ndarray, "6 n n c"]:
-    """Area means of a latlong picture: small parts of the pixels are distributed to the texels.
-
-    Args:
-        image: Radiance, [h, w, c].
-        latitude: Edges of the rows, descending.
-        longitude: Edges of the columns, descending.
-        size: Texels along the edge of a cube face.
-        around: Smallest number of parts around the horizon.
-
-    Returns:
-        Mean radiance of each texel. The integral over the sphere is that of the picture.
-    """
+    """Area means of a latlong picture [h, w, c]: small parts of the pixels are distributed to the texels."""
     # A texel is at least 2 / (3 size) wide, in the corners of a face. About eight parts should fall across it.
     around = max(int(np.ceil(12 * size * 2 * np.pi)), around)
     parts = [max(2, int(np.ceil(around / count))) for count in (2 * image.shape[0], image.shape[1])]
@@ -128,6 +91,7 @@ def _means_of_latlong(
         np.arange(count).repeat(times) for count, times in zip(image.shape[:2], repeat, strict=True)
     )
     rows, columns = (-(-count // times) for count, times in zip(parts, repeat, strict=True))
+    # `latitude` and `longitude` are the edges of the rows and columns, descending.
     latitude = _subdivide(_subdivide(latitude, repeat[0]), rows).reshape(-1)
     longitude = _subdivide(_subdivide(longitude, repeat[1]), columns).reshape(-1)
 

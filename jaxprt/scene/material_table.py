@@ -320,14 +320,7 @@ def _in_image(
 def _read(
     table: MaterialTable, points: Points, place: tuple[Array, Array], texture: Array | int
 ) -> Float[Array, "p 3"]:
-    """Values of a texture at points; 1 at points whose material has none.
-
-    Args:
-        table: The materials.
-        points: The points.
-        place: Their texture coordinates, from `_coordinates`.
-        texture: Index of the texture.
-    """
+    """Values of a texture at points with coordinates `place`, from `_coordinates`; 1 where the material has none."""
     part = table.part[points.corner[0]]
     image = table.image[part, texture]
 
@@ -511,11 +504,9 @@ def _rows(
     old: Mapping[tuple[int, bool], Any] | None = None,
     texels: Texels | None = None,
 ) -> dict[str, Any]:
-    """Factors, textures and images of some materials, padded to a number of materials that scenes share.
-
-    `texels` holds the images `old` already, and serves again if there are no others.
-    """
+    """Factors, textures and images of some materials, padded to a number of materials that scenes share."""
     rows, images = shared_size(len(materials)), _images(materials)
+    # `texels` holds the images `old` already, and serves again if there are no others.
     if texels is None or old is None or set(images) - set(old):
         texels = _texels(images, dtype, texels)
     else:

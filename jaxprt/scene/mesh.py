@@ -85,14 +85,7 @@ def _as_array(value: Any) -> Any:
 
 
 def _check_shapes(mesh: Any) -> None:
-    """Refuses a mesh whose arrays have other types than its fields, or other lengths than its positions.
-
-    Placeholders such as the axes of `jax.vmap` pass. Values are not looked at.
-
-    Raises:
-        TypeError: An array has a wrong type.
-        ValueError: An array has a wrong shape.
-    """
+    """Refuses a mesh whose arrays have other types than its fields, or other lengths than its positions."""
     origin = mesh.origin
     if (
         not isinstance(origin, tuple)
@@ -103,6 +96,7 @@ def _check_shapes(mesh: Any) -> None:
         raise ValueError(f"origin of a mesh must be a tuple of three finite numbers of class float, got {got}")
     for name, (width, whole) in _FIELDS.items():
         value = getattr(mesh, name)
+        # Placeholders such as the axes of `jax.vmap` pass.
         if not isinstance(value, jax.Array | np.ndarray):
             if isinstance(value, _WRONG):
                 raise TypeError(

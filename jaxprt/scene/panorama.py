@@ -187,16 +187,13 @@ def _integral(image: np.ndarray, *, latlong: bool) -> Float64[np.ndarray, " 3"]:
 
 
 def _isotropic(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """A latlong picture whose pixels near the poles are averaged over as many columns as are as wide as a row.
-
-    A pixel of a picture of the sky then need not read hundreds of columns near a pole. Rows that are less than 60
-    degrees from the horizon stay as they are.
-    """
+    """A latlong picture whose pixels near the poles are averaged over as many columns as are as wide as a row."""
     height, width, _ = image.shape
     latitude = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
+    # A pixel of a picture of the sky then need not read hundreds of columns near a pole.
     span = np.minimum(width / (2 * height) / np.cos(latitude) - 1, width)  # columns to average over
     result = image.copy()
-    for row in np.flatnonzero(span > 1):
+    for row in np.flatnonzero(span > 1):  # 60 degrees or more from the horizon
         around = np.cumsum(np.concatenate([np.zeros((1, 3)), image[row], image[row], image[row]]), 0)
         middle = width + 0.5 + np.arange(width)
         total = _interpolate_rows(around, middle + span[row] / 2) - _interpolate_rows(around, middle - span[row] / 2)
@@ -225,16 +222,11 @@ def _halve(image: np.ndarray, *, latlong: bool) -> np.ndarray:
 
 
 def _coarser(image: np.ndarray, axis: int, edge: np.ndarray) -> np.ndarray:
-    """Means over intervals of half the number of pixels, rounded up, along an axis.
-
-    Args:
-        image: The picture.
-        axis: The axis.
-        edge: Where pixels begin and end along the axis, in a coordinate in which areas are equal.
-    """
+    """Means over intervals of half the number of pixels, rounded up, along an axis."""
     count = image.shape[axis]
     fewer = (count + 1) // 2
     place = np.arange(fewer + 1) * (count / fewer)
+    # `edge` is where pixels begin and end along the axis, in a coordinate in which areas are equal.
     new = np.interp(place, np.arange(count + 1), edge)
     first = np.floor(place[:-1]).astype(int)
     result: np.ndarray | None = None

@@ -110,11 +110,9 @@ def _volumes(corner: Float[np.ndarray, "f 3 3"], piece: Int[np.ndarray, " f"]) -
 def _windings(
     corner: Float[np.ndarray, "f 3 3"], piece: Int[np.ndarray, " f"], point: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, " n"]:
-    """How often each piece winds around a point: 1 inside of a closed piece with outward faces, 0 outside.
-
-    Reference: Van Oosterom and Strackee 1983, "The solid angle of a plane triangle".
-    """
+    """How often each piece winds around a point: 1 inside of a closed piece with outward faces, 0 outside."""
     a, b, c = np.moveaxis(corner - point, 1, 0)
+    # Van Oosterom and Strackee 1983, "The solid angle of a plane triangle".
     la, lb, lc = (np.linalg.norm(edge, axis=1) for edge in (a, b, c))
     below = la * lb * lc + np.sum(a * b, 1) * lc + np.sum(b * c, 1) * la + np.sum(c * a, 1) * lb
     angle = 2 * np.arctan2(np.sum(a * np.cross(b, c), 1), below)
@@ -132,12 +130,7 @@ def _has_twin(corner: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
 
 
 def _double(part: Part, copied: Bool[np.ndarray, " f"]) -> tuple[Part, Int[np.ndarray, " _"]]:
-    """The part with reversed copies of some faces, and the vertices that were copied.
-
-    The frame of a copy is the opposite of that of its face.
-
-    Normal maps then bend the normals of both sides as one surface: a bump of the front is a dent of the back.
-    """
+    """The part with reversed copies of some faces, and the vertices that were copied."""
     assert isinstance(part.material, TexturedMaterial)
     material = dataclasses.replace(part.material, back="hidden")
     mesh, count = part.mesh, len(part.mesh.position)
@@ -151,6 +144,7 @@ def _double(part: Part, copied: Bool[np.ndarray, " f"]) -> tuple[Part, Int[np.nd
 
     face = np.concatenate([mesh.face, count + corner.reshape(-1, 3)[:, ::-1]]).astype(np.int32)
     region = np.concatenate([mesh.region, np.asarray(mesh.region)[vertex]])
+    # Opposite frames: normal maps bend both sides as one surface, and a bump of the front is a dent of the back.
     frame = rows(mesh.normal, -1.0), rows(mesh.tangent, -1.0)
     whole = Mesh(rows(mesh.position), face, *frame, region, rows(mesh.texture), mesh.origin)
     side = np.ones(count, np.float32) if part.handedness is None else part.handedness

@@ -202,13 +202,7 @@ def _recurrence(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @functools.lru_cache(maxsize=8)
 def _projection(size: int, degree: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Tables for ``project``.
-
-    Returns:
-        The texels in each of the eight octants [2, 2, 2], by the signs + and - of x, y and z; the position of each
-        coefficient after sorting by parity; and for each parity, even or odd in x, y and z, the integrals of the basis
-        functions over the part of each texel in the octant +++.
-    """
+    """Tables for ``project``: texels of octants, places of coefficients sorted by parity, and integrals by parity."""
     with jax.ensure_compile_time_eval():
         point = np.asarray(cubemap.point(size=size), np.float64).reshape(-1, 3)
     edge = np.unique(np.clip(2 * np.arange(size + 1) / size - 1, 0, None))
@@ -230,6 +224,7 @@ def _projection(size: int, degree: int) -> tuple[np.ndarray, np.ndarray, list[np
     # sizes and degrees.
     count = 4 + math.ceil(3 * (degree + 2) / size)
     node, weight = np.polynomial.legendre.leggauss(count)
+    # Integrals of the basis functions over the part of each texel in the octant +++.
     table = np.zeros(((degree + 1) ** 2, len(octant)))
     for (u, wu), (v, wv) in ((a, b) for a in zip(node, weight, strict=True) for b in zip(node, weight, strict=True)):
         s, t = (low + high + offset * (high - low) for offset in (u, v))

@@ -227,11 +227,7 @@ def _generators(degree: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ladder(l: int, m: int) -> list[tuple[int, float, float]]:
-    """Nonzero entries of the generators L_x and L_y in row m: of L_y in columns m' = m +- 1, of L_x in columns -m'.
-
-    Returns:
-        For each m': m' itself, the entry of L_x in column -m', and the entry of L_y in column m'.
-    """
+    """Nonzero entries of two generators in row m: m' = m +- 1, that of L_x in column -m', that of L_y in column m'."""
     entry = []
     for other in (m - 1, m + 1):
         low, high = sorted((abs(m), abs(other)))
@@ -244,11 +240,9 @@ def _ladder(l: int, m: int) -> list[tuple[int, float, float]]:
 
 
 def _euler_angles(rotation: Array) -> list[tuple[Array, Array]]:
-    """Cosine and sine of alpha, beta, gamma with R = R_z(alpha) R_y(beta) R_z(gamma).
-
-    If the rotation fixes or exchanges the poles, alpha is arbitrary. Near such rotations alpha is inaccurate, because
-    it comes from tiny entries; this does not matter, because gamma compensates for it.
-    """
+    """Cosine and sine of alpha, beta, gamma with R = R_z(alpha) R_y(beta) R_z(gamma)."""
+    # alpha is arbitrary if the rotation fixes or exchanges the poles, and inaccurate nearby, from tiny entries. This
+    # does not matter, because gamma compensates for it.
     alpha = _unit(rotation[0, 2], rotation[1, 2])
     cosine, sine = alpha
     beta = _unit(rotation[2, 2], cosine * rotation[0, 2] + sine * rotation[1, 2])
@@ -292,16 +286,14 @@ def _signed_multiples(cosine: Array, sine: Array, degree: int, axes: int) -> tup
 
 @functools.lru_cache(maxsize=128)
 def _quarter_turn(l: int) -> np.ndarray:
-    """Block D of one band for the quarter turn about x that maps z to y: the exponential of pi / 2 times L_x.
-
-    The eigenvalues of i L_x are integers, so only its eigenvectors have rounding errors. The rotation preserves parity
-    in x and exchanges parity in y and z, so three quarters of the entries are zero.
-    """
+    """Block D of one band for the quarter turn about x that maps z to y: the exponential of pi / 2 times L_x."""
     generator = np.zeros((2 * l + 1, 2 * l + 1))
     for m in range(-l, l + 1):
         for other, by_x, _ in _ladder(l, m):
             generator[l + m, l - other] = by_x
+    # The eigenvalues of i L_x are integers, so only its eigenvectors have rounding errors.
     order, vector = np.linalg.eigh(1j * generator)
     matrix = ((vector * 1j ** np.round(order)) @ vector.conj().T).real
+    # Parity in x is preserved, parity in y and z exchanged, so three quarters of the entries are zero.
     matrix[np.abs(matrix) < 1e-12] = 0
     return matrix

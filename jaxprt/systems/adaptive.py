@@ -138,15 +138,7 @@ def _(colors, primals, tangents):
 
 
 def _walk(add: Callable, total: PyTree, choice: Choice, chosen: Array) -> PyTree:
-    """Sums over all chosen root cells and their descendants, depth first.
-
-    Args:
-        add: Function (total, cells [k 5]) -> (new total, whether to subdivide each child [k 4 4]). A cell is (vertex,
-            level, face, row, column); padding has level -1.
-        total: Initial value of the sum.
-        choice: Data that decide which cells are subdivided; its number of texels sets the number of levels.
-        chosen: Which of the root cells to visit.
-    """
+    """Sums over all chosen root cells and their descendants, depth first."""
     size = haar.face_edge(choice.seen.shape[1])
     deepest = _deepest(size)
     first = jnp.stack(jnp.nonzero(chosen, size=chosen.size, fill_value=0), -1).astype(jnp.int32)
@@ -161,6 +153,7 @@ def _walk(add: Callable, total: PyTree, choice: Choice, chosen: Array) -> PyTree
         after = begun + number - top
         cell = jnp.where((number < top)[:, None], stack[top - 1 - number], first[after])
         valid = (number < top) | (after < count)
+        # A cell is (vertex, level, face, row, column), padding has level -1; `again` says which children to subdivide.
         total, again = add(total, jnp.where(valid[:, None], cell, jnp.array([0, -1, 0, 0, 0])))
         again &= (valid & (cell[:, 1] < deepest))[:, None, None]
         below = jnp.broadcast_to(cell[:, None, None], (*again.shape, 5))
@@ -254,20 +247,18 @@ def _children(node: Array) -> Array:
 
 
 def _is_rough(samples: tuple, vertex: Array, choice: Choice) -> Array:
-    """Whether each child has too large an error and must be subdivided.
-
-    The error of two Gauss points is the fourth difference / 4320. It is estimated by the squared second difference
-    divided by the value, to which it is proportional for a Gaussian lobe. The mirror direction serves as one more
-    sample, to detect a peak between all other samples.
-    """
+    """Whether each child has too large an error and must be subdivided."""
     sent, wi, wo, weight, scale = samples
     gray = jax.lax.optimization_barrier(jnp.mean(sent, -1) * jnp.maximum(wi[2], 0) * weight)
     miss = jnp.zeros_like(gray)
     gap = jnp.where(jnp.arange(2 * SIDE - 1) % 2 == 0, _GAP, 1 - _GAP).astype(gray.dtype)
+    # The error of two Gauss points is the fourth difference / 4320. For a Gaussian lobe, that is proportional to the
+    # squared second difference divided by the value.
     for axis, apart in ((1, gap[None, :, None]), (2, gap[None, None, :])):
         bend = jnp.abs(2 * jnp.diff(jnp.diff(gray, axis=axis) / apart, axis=axis))
         miss += _loss(jnp.pad(bend, [(0, 0), *((1, 1) if axis == a else (0, 0) for a in (1, 2))], mode="edge"), gray)
     wo = wo[:, :, None, None]
+    # The mirror direction serves as one more sample, to detect a peak between all other samples.
     near = (wi[0] + wo[:, 0]) ** 2 + (wi[1] + wo[:, 1]) ** 2 + (wi[2] - wo[:, 2]) ** 2 < _NEAR * weight
     higher = jnp.abs(choice.peak[vertex][:, None, None] * weight - gray)
     miss += jnp.where(near, _loss(_PEAKED * higher, gray + higher), 0)

@@ -155,19 +155,17 @@ class BrightTexels(VertexSystem):
         return rest + texel_radiance(brdf, view.frame, view.wo, texels, self.points, view.blend, **options)
 
     def _diffuse(self, flux: Float[Array, "c 4 v"], view: BrightView) -> Float[Array, "c _"]:
-        """Irradiance / pi by the bright texels: max(F . n + max(E - F . m, 0), 0).
-
-        F and E are the vector and the irradiance of the vertices, interpolated; m is the smooth normal, and n that with
-        the normal map. Between vertices the vector of a sun stays as it is, and that of light from
-        everywhere turns with the normal. F is too short for the second kind, and E too dark for the first.
-        """
+        """Irradiance / pi by the bright texels: max(F . n + max(E - F . m, 0), 0)."""
         if self.points is None:
             return flux[:, 3]
+        # F and E are the vector and irradiance of vertices, interpolated; m is the smooth normal, n that with the map.
         flux, normal = self.carried(flux, axis=2), view.frame[:, 2].T
         smooth = normal
         if self.points.normal is not None:
             smooth = self.points.tilted(None).frame(self.visibility.frame)[:, 2].T
         upright, tilted = (jnp.sum(flux[:, :3] * axis, 1) for axis in (smooth, normal))
+        # Between vertices a sun's vector stays as it is, that of light from everywhere turns with the normal. F is too
+        # short for the second kind, and E too dark for the first.
         return jnp.maximum(tilted + jnp.maximum(flux[:, 3] - upright, 0), 0)
 
     def diffuse_albedo(self, view: BrightView) -> Float[Array, "v c"]:

@@ -228,34 +228,19 @@ def _blocks(texel: Array) -> Array:
 
 
 def _vary(gray: Array, lean: Array, scale: Array, away: Array, height: Array, error: Array) -> Array:
-    """Chooses the root cells in which sampling the BRDF at texel centers is not accurate enough.
-
-    The error of the midpoint rule is f'' / 24 for a function f, plus f' g' / 12 for a product f g. The horizon adds at
-    most an eighth of a texel's edge. The mirror direction serves as one more sample, to detect a peak between centers.
-
-    Args:
-        gray: BRDF at the texel centers [e t], in 1/sr, averaged over colors. The first axis is the place of a texel in
-            its root cell, the second the index of the cell.
-        lean: Integral of the cosine over each texel [e t], in sr; negative below the horizon.
-        scale: Visible light of each texel [e t] divided by the radiance of the vertex; the maximum over lights.
-        away: Vector from the mirror direction to the center of each cell [t 3].
-        height: BRDF x cosine in the mirror direction, in 1/sr.
-        error: Largest relative error.
-
-    Returns:
-        Whether each cell [t] must be subdivided.
-    """
+    """Chooses the root cells t in which sampling the BRDF at texel centers [e t] is not accurate enough."""
     if len(gray) == 1:
         return jnp.broadcast_to(error < jnp.inf, gray[0].shape)
     side, edge = adaptive.SIDE, 2 / haar.face_edge(gray.size)
-    flux = jnp.maximum(lean, 0)
+    flux = jnp.maximum(lean, 0)  # `lean`: integral of the cosine over a texel in sr, negative below the horizon
     miss, size, top, hidden, cut = (jnp.zeros_like(gray[0]) for _ in range(5))
     # Texels are written out one by one, so that XLA fuses all that follows into one loop over cells.
     for here in range(side**2):
-        much, sent = scale[here], gray[here] * flux[here]
+        much, sent = scale[here], gray[here] * flux[here]  # `scale`: visible light / vertex's radiance, most of lights
         for step, place in ((side, here // side), (1, here % side)):
             if 0 < place < side - 1:
                 back, ahead = here - step, here + step
+                # The error of the midpoint rule is f'' / 24, plus f' g' / 12 for a product f g.
                 bend = jnp.abs(gray[back] - 2 * gray[here] + gray[ahead]) * flux[here] / 24
                 bend += jnp.abs((gray[ahead] - gray[back]) * (flux[ahead] - flux[back])) / 48
                 miss += 2 * bend * much  # for the two inner rows and the two outer ones
@@ -263,6 +248,8 @@ def _vary(gray: Array, lean: Array, scale: Array, away: Array, height: Array, er
         top = jnp.maximum(top, gray[here])
         hidden += jnp.abs(height * edge**2 - sent) * much
         cut += jnp.where(jnp.abs(lean[here]) < edge**3 / 2, much, 0)
+    # The mirror direction, of BRDF x cosine `height`, serves as one more sample, to detect a peak between centers.
     near = jnp.sum(away**2, -1) < ((2.5 + side / np.sqrt(2)) * edge) ** 2
+    # The horizon adds at most an eighth of a texel's edge.
     miss += jnp.where(near, hidden / 8, 0) + edge**3 / 16 * top * cut
     return miss > error * jnp.maximum(size, adaptive.SMALL)

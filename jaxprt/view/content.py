@@ -163,18 +163,12 @@ class _Tables:
 
 
 class _Images:
-    """The images of a page's textures. Textures of one image share it.
-
-    Attributes:
-        described: Size and number of channels of each image.
-        data: Bytes of each image, first row on top; colors are encoded by sRGB. Normals are 127 (normal + 1), so that
-            their zeros and ones are exact.
-    """
+    """The images of a page's textures. Textures of one image share it."""
 
     def __init__(self):
         """Starts without images."""
-        self.described: list[dict[str, int]] = []
-        self.data: list[np.ndarray] = []
+        self.described: list[dict[str, int]] = []  # size and number of channels of each image
+        self.data: list[np.ndarray] = []  # first row on top; colors are encoded by sRGB
         self._number: dict[tuple[int, str], int] = {}
 
     def add(self, texture: Texture, name: str) -> dict[str, Any]:
@@ -192,6 +186,7 @@ class _Images:
             height, width, channels = value.shape
             self._number[key] = len(self.data)
             self.described.append({"width": width, "height": height, "channels": channels})
+            # Normals are 127 (normal + 1), so that their zeros and ones are exact.
             self.data.append(np.round((254 if normal else 255) * value).astype(np.uint8))
         how = {"transform": np.asarray(texture.transform, float).tolist(), "set": texture.set, "wrap": texture.wrap}
         return {"image": self._number[key], **how}

@@ -73,17 +73,11 @@ class PageError(NamedTuple):
 
 
 class _Views(NamedTuple):
-    """Small pictures around a scene, at the pixels that show surfaces.
-
-    Attributes:
-        cameras: One for each picture.
-        pixel: Pixels of each picture that show surfaces.
-        part: Part that each of these shows, of all pictures one after another.
-    """
+    """Small pictures around a scene, at the pixels that show surfaces."""
 
     cameras: Sequence[Camera]
     pixel: Sequence[Int[np.ndarray, " _"]]
-    part: Int[np.ndarray, " n"]
+    part: Int[np.ndarray, " n"]  # that each of these pixels shows, of all pictures one after another
 
     @classmethod
     def around(cls, scene: RelitScene) -> "_Views":
@@ -152,19 +146,10 @@ def _causes(
     scene: RelitScene,
     page: PageScene,
     light: Environment,
-    whole: Float[np.ndarray, "n 3"],
-    shown: Float[np.ndarray, "n 3"],
+    whole: Float[np.ndarray, "n 3"],  # pictures of the scene
+    shown: Float[np.ndarray, "n 3"],  # pictures of the page
 ) -> tuple[Cause, ...]:
-    """What each step from the scene to the page changes: shadows of vertices, then less and less light in both.
-
-    Args:
-        views: The views.
-        scene: The scene.
-        page: The scene as the page holds it.
-        light: The light.
-        whole: Pictures of the scene.
-        shown: Pictures of the page.
-    """
+    """What each step from the scene to the page changes: shadows of vertices, then less and less light in both."""
     now = views.pictures(scene, light, "vertices")
     steps = {"shadows": whole - now}
     if scene.lamps is not None:

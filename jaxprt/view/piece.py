@@ -167,11 +167,7 @@ class _Size(NamedTuple):
 
 
 def _sizes(page: PageScene) -> Iterator[tuple[bool, _Size]]:
-    """Whether a page has the visibility of single texels, and its resolution, from the finest to the coarsest.
-
-    The data that takes more bytes is reduced first. With the visibility of single texels, the page makes averaged
-    visibility from it, which then takes no bytes.
-    """
+    """Whether a page has the visibility of single texels, and its resolution, from the finest to the coarsest."""
     scale, counts = page.scales, [held.vector.shape[1] for held in page.parts]
     lobes = sum(count for count, held in zip(counts, page.parts, strict=True) if held.scales is not None)
     matrices = [(count, held.degree) for count, held in zip(counts, page.parts, strict=True) if held.degree is not None]
@@ -181,6 +177,7 @@ def _sizes(page: PageScene) -> Iterator[tuple[bool, _Size]]:
         while True:
             yield texels, _Size(level, 0 if scale is None else int(scale.edge[level]), degree)
             means = 0
+            # From single texels the page makes averaged visibility, which then takes no bytes.
             if scale is not None and not texels and level < len(scale.edge) - 1:
                 means = lobes * int(scale.total - scale.start[level])
             bands = 0
@@ -188,6 +185,7 @@ def _sizes(page: PageScene) -> Iterator[tuple[bool, _Size]]:
                 bands = sum(count * (2 * min(most, degree) + 1) ** 2 for count, most in matrices)
             if not means and not bands:
                 break
+            # The data that takes more bytes is reduced first.
             if means >= bands:
                 level += 1
             else:
@@ -232,15 +230,7 @@ def _page(
 
 
 def _skies(session: Session, room: int | float) -> list[Reply | None]:
-    """Pictures of the lights for the background, as fine as their files and the room in the page permit.
-
-    Args:
-        session: The session of the page.
-        room: Bytes of the page that the pictures may take.
-
-    Returns:
-        One for each light; None for a light without the pixels of a file, whose texels are shown.
-    """
+    """Pictures of the lights for the background, as fine as files and `room` in bytes permit; None without a file."""
     shown = [light.panorama is not None for light in session.stages.lights]
     rows = _SKY_ROWS if any(shown) else 0
     while rows > _LEAST_SKY_ROWS:

@@ -92,11 +92,7 @@ class Progress:
 
 
 class _Way:
-    """The share of all stages that is done.
-
-    A stage that is reported anew, or again from its start, takes its planned part of what was left before it. A stage
-    that was not planned takes none, and the share waits.
-    """
+    """The share of all stages that is done."""
 
     def __init__(self, stages: Sequence[tuple[str, float]]):
         self._left = list(stages)
@@ -115,6 +111,8 @@ class _Way:
     def _begin(self, stage: str) -> None:
         self._first = self._last = self._done
         place = next((number for number, (name, _) in enumerate(self._left) if name == stage), None)
+        # A stage that is reported anew, or again from its start, takes its planned part of what was left before it. One
+        # that was not planned takes none, and the share waits.
         if place is not None:
             (_, part), *self._left = self._left[place:]
             self._last += (1 - self._done) * part / (part + sum(other for _, other in self._left))

@@ -285,11 +285,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         return data
 
     def _allowed(self) -> str | None:
-        """The path after the token. None if the request was refused: by its token, its host, or the page's origin.
-
-        A page of another origin could not read the answers, but a name that an attacker points to this machine would
-        make its page one of this origin. The header Host then has that name.
-        """
+        """The path after the token. None if the request was refused: by its token, its host, or the page's origin."""
         hosts, origins = (self.headers.get_all(name, []) for name in ("Host", "Origin"))
         if len(hosts) != 1 or len(origins) > 1 or self.headers.defects or self.headers.get_payload():
             self._refuse(
@@ -302,6 +298,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
                 403, "this address lacks the viewer's token: open the whole address that the viewer has printed"
             )
         elif hosts[0].lower() not in self.server.hosts:
+            # A name that an attacker points to this machine would make its page one of this origin; Host has that name.
             self._refuse(403, self._stranger("Host", hosts[0], self.server.hosts))
         elif origins and origins[0] not in self.server.origins:
             self._refuse(403, self._stranger("Origin", origins[0], self.server.origins))

@@ -50,17 +50,11 @@ class _LateError(Exception):
 
 
 class _Version(NamedTuple):
-    """A scene that a session shows.
+    """A scene that a session shows."""
 
-    Attributes:
-        number: Number of scenes that the session has shown, this one included.
-        stages: Lights, materials and views of the scene.
-        preview: Whether a better scene follows.
-    """
-
-    number: int
-    stages: Stages
-    preview: bool
+    number: int  # of scenes that the session has shown, this one included
+    stages: Stages  # lights, materials and views of the scene
+    preview: bool  # whether a better scene follows
 
 
 class Session:
@@ -261,10 +255,8 @@ class Session:
         return Reply({"kind": "sky", "scale": scale, "width": width, "height": height, "levels": len(levels)}, [data])
 
     def _progress(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
-        """What is being prepared, and the number of scenes so far. It grows when there is a better scene.
-
-        A page says how large its pictures are, so that their programs can be compiled ahead.
-        """
+        """What is being prepared, and the number of scenes so far. It grows when there is a better scene."""
+        # A page says how large its pictures are, so that their programs can be compiled ahead.
         if "width" in message:
             self._size = _size(message)[:2]
         return Reply(self.progress.content() | {"version": self.version}, [])

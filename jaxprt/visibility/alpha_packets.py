@@ -313,13 +313,11 @@ _filter = packets.callback(types.void(types.voidptr), _veil)
 @no_type_check
 @numba_loop
 def _empty_context(context, arguments, mode):
-    """Fills the context of rays and the arguments of a query: flags and features, context, filter, callback.
-
-    Embree passes coherent packets once for each octant of their directions, and may filter a hit each time. Shares of
-    light are products, so that hits must be filtered once.
-    """
+    """Fills the context of rays and the arguments of a query: flags and features, context, filter, callback."""
     context[:] = -1
     context[_MODE] = mode
+    # Embree passes coherent packets once for each octant of their directions, and may filter a hit each time. Shares of
+    # light are products, so that hits must be filtered once.
     arguments[0] = packets.EVERY_FEATURE << 32 | (0 if mode == _PASSED else packets.COHERENT)
     arguments[1] = context.ctypes.data
     arguments[2] = arguments[3] = 0

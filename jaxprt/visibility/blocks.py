@@ -111,12 +111,9 @@ def cores() -> int:
 
 
 def _check_context(executor: Executor | None) -> None:
-    """Refuses process pools that fork.
-
-    A forked process has the locks of JAX's threads but not the threads, and waits forever for a lock that one of them
-    held.
-    """
+    """Refuses process pools that fork."""
     context = getattr(executor, "_mp_context", None) if isinstance(executor, ProcessPoolExecutor) else None
+    # A forked process has the locks of JAX's threads but not the threads, and waits forever for a lock that one held.
     if context is not None and context.get_start_method() == "fork":
         raise ValueError(
             'executor must not fork this process, got a ProcessPoolExecutor with the context "fork": JAX runs threads, '
@@ -272,11 +269,7 @@ def tracked(items: Sequence[Item], progress: Progress, label: str, *, unit: str)
 
 
 class _Memory:
-    """Results that are held in memory only, without a store.
-
-    Attributes:
-        array: The result arrays.
-    """
+    """Results that are held in memory only, without a store."""
 
     def __init__(self, job: Job, counts: Mapping[str, int]):
         self._job = job
@@ -341,10 +334,7 @@ def _run(job, todo, keep, store, executor, bar) -> None:
 
 
 class _Flow:
-    """Submits blocks to an executor, a bounded number at a time, so that results do not accumulate in memory.
-
-    The job is sent to each worker that does not have it yet, also in a bounded number of copies.
-    """
+    """Submits blocks to an executor, a bounded number at a time, so that results do not accumulate in memory."""
 
     def __init__(self, pool: Executor, key: str, work: tuple[Job, BlockStore | None], *, ahead: int):
         self._pool, self._key, self._work, self._ahead = pool, key, work, ahead
@@ -376,6 +366,7 @@ class _Flow:
 
     def _submit(self, block: int) -> None:
         sent = None
+        # The job is sent to each worker that does not have it yet, also in a bounded number of copies.
         if self._asked:
             if self._pickle is None:
                 self._pickle = pickle.dumps(self._work)
@@ -392,10 +383,7 @@ _jobs: dict[str, tuple[Job, BlockStore | None]] = {}
 
 
 def _work(key: str, sent: bytes | None, block: int) -> tuple[Mapping[str, np.ndarray] | None, int] | None:
-    """Computes one block in a worker. Returns None if the worker has not received the job yet.
-
-    In place of the block's arrays it returns None if it has written them to the store.
-    """
+    """Computes one block in a worker; None if it has not received the job yet, and no arrays if the store has them."""
     if sent is not None and key not in _jobs:
         while len(_jobs) > 1:
             _jobs.pop(next(iter(_jobs)))

@@ -90,10 +90,8 @@ class Occluder:
 
     @cached_property
     def _twin(self) -> tuple[np.ndarray, np.ndarray]:
-        """For each face, the coincident face of opposite orientation, and its corners in the order of its own corners.
-
-        A face without such a partner is its own. Which of the two a ray hits is arbitrary.
-        """
+        """For each face, the coincident one of opposite orientation, or itself; and its corners in the face's order."""
+        # Which of the two coincident faces a ray hits is arbitrary.
         _, place = np.unique(self.position, axis=0, return_inverse=True)
         at = place.reshape(-1)[self.face]
         order = np.argsort(at, axis=1)

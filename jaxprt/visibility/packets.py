@@ -232,14 +232,12 @@ def library() -> Embree | None:
 @no_type_check
 @intrinsic
 def _call(typing, address, valid, scene, ray, arguments):
-    """Calls void (*)(const int*, RTCScene, RTCRayN*, RTCOccludedArguments*), or `rtcIntersectN`, at an address.
-
-    The address is an argument, rather than a ctypes function, so that numba can cache the compiled code on disk.
-    """
+    """Calls void (*)(const int*, RTCScene, RTCRayN*, RTCOccludedArguments*), or `rtcIntersectN`, at an address."""
 
     def generate(context, builder, signature, values):
         byte = llvmlite.ir.IntType(8).as_pointer()
         kind = llvmlite.ir.FunctionType(llvmlite.ir.VoidType(), [byte] * 4)
+        # The address is an argument, not a ctypes function, so that numba can cache the compiled code on disk.
         function = builder.inttoptr(values[0], kind.as_pointer())
         builder.call(function, [builder.inttoptr(value, byte) for value in values[1:]])
         return context.get_dummy_value()
@@ -484,10 +482,7 @@ def whole_ray(ray):
 @no_type_check  # Run-time type checks would wrap the function, and numba could not cache it on disk.
 @partial(numba_loop, error_model="numpy")  # Checks of divisors would keep the loop over lanes from being vectorized.
 def _sums(place, area, begin, count, center, normal, least, total, room):
-    """Adds the integrals of places of one piece to `total`, for sixteen points; False if a point is too close to one.
-
-    The integrals are of 1 and of the direction, over the solid angle above the horizon of the normal.
-    """
+    """Adds integrals of places of one piece to `total`, for sixteen points; False if a point is too close to one."""
     room[:] = np.inf
     for number in range(begin, begin + count):
         x, y, z = place[number, 0], place[number, 1], place[number, 2]
@@ -504,6 +499,7 @@ def _sums(place, area, begin, count, center, normal, least, total, room):
             facing = max(-(dx * a + dy * b + dz * c) * inverse, lowest)
             solid = (facing if height > zero else zero) / (square + disk)
             along = solid * inverse
+            # The integrals are of 1 and of the direction, over the solid angle above the horizon of the normal.
             total[0, lane] += solid
             total[1, lane] += along * dx
             total[2, lane] += along * dy
@@ -537,10 +533,7 @@ def _lit_share(lamp, lamps, center, normal, least, total, room):
 @no_type_check
 @partial(numba_loop, error_model="numpy")
 def _cast(query, memory, lamps, aim, origin, sight, weight, free):
-    """Traces one ray of each of sixteen points, to its own place on a lamp; the number of rays, and of free ones.
-
-    Adds the irradiance from each place to `weight` of its piece, and to `free` that from visible places.
-    """
+    """Traces one ray of each of sixteen points, to its own place on a lamp; the number of rays, and of free ones."""
     number, spot, piece = aim
     entry, scene, arguments, _, passed = query
     buffers, cosine, goal = memory
@@ -573,8 +566,8 @@ def _cast(query, memory, lamps, aim, origin, sight, weight, free):
     rays, open_ = 0, 0
     for lane in range(16):
         seen = valid[lane] != 0 and ray[8, lane] > zero
-        weight[piece[lane], lane] += cosine[lane]
-        free[piece[lane], lane] += cosine[lane] * passed[lane] if seen else zero
+        weight[piece[lane], lane] += cosine[lane]  # irradiance from each place
+        free[piece[lane], lane] += cosine[lane] * passed[lane] if seen else zero  # that from visible places
         rays += 1 if cosine[lane] > zero else 0
         open_ += 1 if seen else 0
     return rays, open_
@@ -583,16 +576,13 @@ def _cast(query, memory, lamps, aim, origin, sight, weight, free):
 @no_type_check
 @numba_loop
 def _visible(query, memory, lamp, lamps, pattern, origin, sight, total, weight, free):
-    """Replaces `free` by the visible share of each piece of a lamp at sixteen points.
-
-    The first rays go to one quarter of each stratum of the lamp. If they differ in what they meet, rays to the other
-    quarters follow.
-    """
+    """Replaces `free` by the visible share of each piece of a lamp at sixteen points."""
     first, count, pieces, strata = lamps[2][lamp, -1], lamps[3][lamp, -1], lamps[4][lamp], lamps[5][lamp]
     weight[:], free[:] = 0, 0
     number, spot, piece = np.empty(16, np.int64), np.empty(16, np.int64), np.empty(16, np.int64)
     width = count * pieces // (strata * _QUARTERS)  # 0 for a point light
     rays, open_ = 0, 0
+    # The first rays go to one quarter of each stratum. If they differ in what they meet, the others follow.
     for turn in range(_QUARTERS):
         if turn > 0 and (width == 0 or open_ == 0 or open_ == rays):
             break

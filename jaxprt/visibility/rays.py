@@ -338,10 +338,8 @@ def _boundary(clear: np.ndarray, border: np.ndarray) -> np.ndarray:
 
 
 def _dither(value: np.ndarray, vertex: np.ndarray, texel: np.ndarray) -> np.ndarray:
-    """Whole numbers whose mean over neighboring texels is that of the values, by ordered dithering.
-
-    Rounding to the nearest would change the share that all texels behind one translucent surface have, by up to 1/32.
-    """
+    """Whole numbers whose mean over neighboring texels is that of the values, by ordered dithering."""
+    # Rounding to the nearest would change the share that all texels behind a translucent surface have, by up to 1/32.
     return np.floor(value + (_KRONECKER[0] * texel + _KRONECKER[1] * vertex) % 1)
 
 

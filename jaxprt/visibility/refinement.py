@@ -237,16 +237,7 @@ def _visible_places(mesh: Mesh, views: Sequence[Camera]) -> tuple[subdivision.Tr
 
 
 class _Surface:
-    """Triangles with the radiance at vertices, at midpoints of edges, and at points inside of large triangles.
-
-    Attributes:
-        position: Positions of the vertices.
-        normal: Normals of the vertices, of any length.
-        face: Vertex indices of each triangle.
-        light: Radiance at the vertices.
-        error: Squared error of interpolation under each light, averaged over each triangle.
-        offset: Distance of ray origins from each triangle.
-    """
+    """Triangles with the radiance at vertices, at midpoints of edges, and at points inside of large triangles."""
 
     def __init__(
         self,
@@ -257,7 +248,7 @@ class _Surface:
     ):
         self.position, self.normal = np.asarray(mesh.position), np.asarray(mesh.normal, np.float64)
         self.face = np.asarray(mesh.face, np.int64)
-        self.offset = tracer.offset
+        self.offset = tracer.offset  # distance of ray origins from each triangle
         self._tracer, self._casts = tracer, tracer.casts
         corner = self.position[self.face].astype(np.float64)
         longest = np.linalg.norm(np.roll(corner, -1, 1) - corner, axis=2).max(1)
@@ -276,6 +267,7 @@ class _Surface:
         self._points = subdivision.TrianglePoints(*(np.concatenate([one, other[coarse]]) for one, other in pairs))
         self._picture = np.concatenate([np.zeros(len(even.triangle)), seen[1][coarse]])
         self._at_points, self._inside = self._traced_points()
+        # Squared error of interpolation under each light, averaged over each triangle.
         self.error = np.zeros((len(self.face), self.light.shape[1]))
         self._measure(np.flatnonzero(self._coarse))
 
@@ -395,11 +387,9 @@ class _Surface:
     def _beside(
         self, triangle: Int[np.ndarray, " p"], place: Float[np.ndarray, "p 3"], normal: Float[np.ndarray, "p 3"]
     ) -> tuple[Float32[np.ndarray, "p l c"], Bool[np.ndarray, " p"]]:
-        """The result of `_traced_points`, for points of triangles without a second side.
-
-        Each point becomes a vertex of a small triangle, so that its ray origin is found like that of a vertex.
-        """
+        """The result of `_traced_points`, for points of triangles without a second side."""
         count = len(self.position)
+        # Each point becomes a vertex of a small triangle, so that its ray origin is found like that of a vertex.
         small = (0.5 / np.sqrt(1 + np.bincount(triangle, minlength=1)))[triangle, None, None]
         beside = place[:, None] + small * (self.position[self.face[triangle]][:, :2] - place[:, None])
         position = np.concatenate([place, beside.reshape(-1, 3)]).astype(self.position.dtype)
@@ -414,13 +404,11 @@ class _Surface:
     def _on_sheets(
         self, triangle: Int[np.ndarray, " p"], place: Float[np.ndarray, "p 3"], normal: Float[np.ndarray, "p 3"]
     ) -> tuple[Float32[np.ndarray, "p l c"], Bool[np.ndarray, " p"]]:
-        """The result of `_traced_points`, for points of triangles with two sides.
-
-        Only shared vertices tell the sides apart. Rays start on that of the normal, whatever touches the sheet there.
-        """
+        """The result of `_traced_points`, for points of triangles with two sides."""
         one, other = (self.position[self.face[triangle, corner]].astype(np.float64) - place for corner in (0, 1))
         out = np.cross(one, other)
         out /= np.maximum(np.linalg.norm(out, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+        # Only shared vertices tell the sides apart. Rays start on that of the normal, whatever touches the sheet there.
         out *= np.where(np.sum(out * normal, 1, keepdims=True) < 0, -1, 1)
         return self._tracer.at_points(place + self.offset[triangle, None] * out, normal, out)
 

@@ -199,10 +199,7 @@ def start_points_and_buried(
 
 
 def _inward(position: np.ndarray, face: np.ndarray, out: np.ndarray) -> Float32[np.ndarray, "v 3"]:
-    """Steps along the surface, in offsets, from vertices at the border of flat faces to the inside of these faces.
-
-    Where such a vertex lies in a wall that stands on its face, rays start in front of the wall, and not in it.
-    """
+    """Steps along the surface, in offsets, from vertices at the border of flat faces to the inside of these faces."""
     position = position.astype(np.float64)
     toward = position[face].mean(1)[:, None] - position[face]
     toward /= np.maximum(np.linalg.norm(toward, axis=-1, keepdims=True), 1e-30)
@@ -214,6 +211,7 @@ def _inward(position: np.ndarray, face: np.ndarray, out: np.ndarray) -> Float32[
         flat, face.ravel(), np.abs(np.sum(np.repeat(_face_normal(position, face), 3, 0) * out[face.ravel()], 1))
     )
     mean -= np.sum(mean * out, 1, keepdims=True) * out
+    # Where such a vertex lies in a wall that stands on its face, rays start in front of the wall, and not in it.
     return (_INWARD * np.where(flat[:, None] > _FLAT, mean, 0)).astype(np.float32)
 
 
@@ -231,15 +229,7 @@ def _face_normal(position: np.ndarray, face: np.ndarray) -> np.ndarray:
 
 
 def _outward(mesh: Mesh, apart: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors that point off the surface, to the side of each vertex's shading normal.
-
-    They average the normals of all faces at the same position. Where vertices are split along a crease, faces across
-    the crease count too; otherwise a ray could start inside of them. With `apart`, they count within a region. Where
-    the mean grazes a face, or is behind it, the vector is turned off that face.
-
-    Returns:
-        The vectors, and for each vertex the smallest cosine between its vector and the normals of the faces that count.
-    """
+    """Unit vectors off the surface, to the side of shading normals, and the smallest cosine of each with its faces."""
     position, face, normal = np.asarray(mesh.position), np.asarray(mesh.face), np.asarray(mesh.normal, np.float64)
     facing = _face_normal(position, face)
     sided = np.stack(
@@ -249,6 +239,7 @@ def _outward(mesh: Mesh, apart: bool) -> tuple[np.ndarray, np.ndarray]:
     _, place = np.unique(_rows(position), return_inverse=True)
     if apart:
         _, place = np.unique(place + len(position) * np.asarray(mesh.region, np.int64), return_inverse=True)
+    # Faces across a crease count too, within a region if `apart`; otherwise a ray could start inside of them.
     joint = _sum_by_index(place, of_vertex, len(normal))[place]
     # The normals of the two sides of a sheet cancel; each vertex then uses its own faces only.
     shared = np.sum(joint * of_vertex, 1) > 1e-6 * np.sum(of_vertex * of_vertex, 1)
@@ -264,22 +255,14 @@ def _outward(mesh: Mesh, apart: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _off_faces(out: np.ndarray, group: np.ndarray, facing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Turns vectors off the faces that they graze, by steps towards the normal of the worst face.
-
-    Args:
-        out: Unit vectors.
-        group: Index of the vector of each corner of a face.
-        facing: Unit normal of the face of each corner, on the vector's side.
-
-    Returns:
-        For each vector the smallest cosine with the normals of its faces, and the turned vectors.
-    """
+    """The smallest cosine of each vector with its faces, and vectors turned off faces that they graze, step by step."""
 
     def smallest(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         cosine, least = np.sum(facing * vector[group], 1), np.ones(len(vector))
         np.minimum.at(least, group, cosine)
         return cosine, least
 
+    # `group` is the vector of each corner of a face, `facing` the unit normal of that face on the vector's side.
     cosine, least = smallest(out)
     grazing = least < _STEEPEST
     if not grazing.any():
@@ -317,16 +300,13 @@ def _surface(occluder: Occluder, position: np.ndarray, out: np.ndarray, offset: 
 def _off_contact(
     occluder: Occluder, position: np.ndarray, start: np.ndarray, out: np.ndarray, offset: np.ndarray
 ) -> np.ndarray:
-    """Moves ray origins that were pushed through a touching surface back to its open side, by reflection.
-
-    A ray traced back towards the vertex meets a touching surface from behind, and the vertex's own faces from the
-    front. Rays beside the vertex find a touching surface even where it passes through the vertex.
-    """
+    """Moves ray origins that were pushed through a touching surface back to its open side, by reflection."""
     facing = _face_normal(occluder.position, occluder.face)
     side = np.cross(out, np.eye(3, dtype=np.float32)[np.argmin(np.abs(out), 1)])
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     result = start.copy()
     open_start = np.ones(len(start), bool)
+    # Rays beside the vertex find a touching surface even where it passes through the vertex.
     for beside in (0 * side, side, -side, np.cross(out, side), -np.cross(out, side)):
         triangle, distance, _ = occluder.hit(start + offset / 2 * beside, -out, solid=True)
         # Distances of a few spacings of float32 are themselves rounded by one or two.
@@ -337,6 +317,7 @@ def _off_contact(
         corner = occluder.position[occluder.face[triangle[hit]]]
         # The two sides of a seam may differ by rounding.
         seam = np.abs(corner - position[hit, None]).max(2).min(1, initial=np.inf) <= offset[hit, 0] / 4
+        # A ray back towards the vertex meets a touching surface from behind, and the vertex's own faces from the front.
         touching = ~seam & (np.sum(back * out[hit], 1) < 0)
         hit, back, corner = hit[touching], back[touching], corner[touching]
         height = np.sum((corner[:, 0] - start[hit]) * back, 1, keepdims=True)

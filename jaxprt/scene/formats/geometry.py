@@ -334,11 +334,7 @@ def from_polygons(
 
 
 def _divide(position: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of polygons with n corners [p n], and polygons that stay fans because too many of their edges cross.
-
-    Returns:
-        The triangles [p n-2 3] as numbers 0 to n-1 of corners, -1 where there are less; and indices of the polygons.
-    """
+    """Triangles [p n-2 3] of polygons [p n] by corner, -1 for none; and those that stay fans: too many edges cross."""
     size, crossed = corner.shape[1], np.zeros(0, int)
     fan = np.stack([np.zeros(size - 2, int), np.arange(1, size - 1), np.arange(2, size)], -1)
     triangle = np.tile(fan, (len(corner), 1, 1))
@@ -380,14 +376,10 @@ def _project(point: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 def _crosses_itself(plane: np.ndarray) -> bool:
-    """Whether many edges of a polygon [n 2] cross each other.
-
-    Edges of a simple polygon cross a line upward and downward in turn, so the winding number beside the line is 0 or 1,
-    or 0 or -1. The lines lie in the widest gap of each 32nd of the corners, along both axes, so they always meet a knot
-    of a sixteenth of the corners.
-    """
+    """Whether many edges of a polygon [n 2] cross each other."""
     for across, along in (plane.T, plane.T[::-1]):
         value = np.sort(across)
+        # The lines, in the widest gap of each 32nd of the corners, always meet a knot of a sixteenth of the corners.
         for span in np.array_split(np.arange(len(value) - 1), _LINES):
             gap = value[span + 1] - value[span]
             widest = gap.argmax()
@@ -401,6 +393,8 @@ def _crosses_itself(plane: np.ndarray) -> bool:
             share = (level - across[low]) / (across[high] - across[low])
             place = along[low] + share * (along[high] - along[low])
             order = np.argsort(place)
+            # Edges of a simple polygon cross a line upward and downward in turn, so the winding number beside the line
+            # is 0 or 1, or 0 or -1.
             winding = np.cumsum(np.where(below[start], 1, -1)[order])
             apart = np.diff(place[order], append=np.inf) > _REVERSED + 1e-15 / gap[widest]  # or on top of each other
             if np.ptp(winding[apart]) > 1:
@@ -409,13 +403,7 @@ def _crosses_itself(plane: np.ndarray) -> bool:
 
 
 def _clip_ears(plane: np.ndarray, point: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Triangles [p n-2 3] of polygons [p n 3], as numbers of corners; -1 where there are less.
-
-    Args:
-        plane: The polygons, projected along their normals [p n 2].
-        point: The polygons [p n 3].
-        normal: Their unit normals [p 3].
-    """
+    """Triangles [p n-2 3] by corner, -1 for none, of polygons [p n 3], whose projections along normals are `plane`."""
     size = point.shape[1]
     triangle = np.full((len(point), size - 2, 3), -1, np.int64)
     for polygon, corners in enumerate(plane):
@@ -429,10 +417,7 @@ def _clip_ears(plane: np.ndarray, point: np.ndarray, normal: np.ndarray) -> np.n
 
 
 def _add_skipped(triangle: np.ndarray, point: np.ndarray, normal: np.ndarray) -> None:
-    """Adds triangles for corners that ear clipping left out, on a line or at one place, to those of one polygon.
-
-    They have no area in the projection. Without them, polygons on the other side of the edge could show a gap.
-    """
+    """Adds triangles for corners that ear clipping left out, on a line or at one place, to those of one polygon."""
     size, free = point.shape[1], np.flatnonzero(triangle[0, :, 0] < 0)
     corner = np.unique(triangle[triangle >= 0])
     following = np.append(corner[1:], corner[:1] + size)
@@ -442,6 +427,7 @@ def _add_skipped(triangle: np.ndarray, point: np.ndarray, normal: np.ndarray) ->
         for step in range(1, end - start)
     ]
     added = np.array(skipped, np.int64).reshape(1, -1, 3) % size
+    # They have no area in the projection. Without them, polygons on the other side of the edge could show a gap.
     added = added[:, np.abs(_areas(point, added, normal))[0] <= _REVERSED][:, : len(free)]
     triangle[:, free[: added.shape[1]]] = added
 

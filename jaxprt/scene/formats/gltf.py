@@ -218,12 +218,10 @@ class MaterialReader:
         }
 
     def _cover(self, item: dict[str, Any], pbr: dict[str, Any], owner: str) -> dict[str, Any]:
-        """What a material hides: its alpha, and its back (sections 3.9.4 and 3.9.5).
-
-        An alpha mode that the specification does not have counts as opaque, and is recorded.
-        """
+        """What a material hides: its alpha, and its back (sections 3.9.4 and 3.9.5)."""
         field: dict[str, Any] = {"back": "lit" if self._document.boolean(item, "doubleSided", owner) else "hidden"}
         mode = item.get("alphaMode", "OPAQUE")
+        # An alpha mode that the specification does not have counts as opaque.
         if not isinstance(mode, str) or mode not in _ALPHA_MODES:
             self.ignored.add(f"alpha mode {excerpt(mode)}")
             return field
@@ -317,17 +315,14 @@ class MaterialReader:
         self._damaged.add(key)
 
     def _transform(self, moved: dict[str, Any], owner: str) -> np.ndarray:
-        """The affine transform of KHR_texture_transform, for texture coordinates with v up.
-
-        For v down, the matrix is [cos sin; -sin cos] times the scale, so that "counter-clockwise" holds as seen on the
-        image. three.js and Blender's importer agree. The GLSL code in the extension's text, read by columns, rotates
-        the other way.
-        """
+        """The affine transform of KHR_texture_transform, for texture coordinates with v up."""
         (x, y), (across, down) = (
             self._number(moved, key, default, owner) for key, default in (("offset", (0.0, 0.0)), ("scale", (1.0, 1.0)))
         )
         angle = self._number(moved, "rotation", 0.0, owner)
         cosine, sine = np.cos(angle), np.sin(angle)
+        # For v down. "Counter-clockwise" holds as seen on the image; three.js and Blender's importer agree. The GLSL
+        # code in the extension's text, read by columns, rotates the other way.
         matrix = np.array([[cosine * across, sine * down, x], [-sine * across, cosine * down, y], [0, 0, 1]])
         flip = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
         with np.errstate(over="ignore"):  # textures refuse transforms that are not finite

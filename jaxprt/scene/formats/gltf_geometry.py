@@ -578,12 +578,10 @@ def _placements(
     mesh_of: Sequence[int],
     primitives: dict[int, list[Primitive]],
 ) -> Iterator[tuple[Node, Primitive, Geometry]]:
-    """The primitives of all nodes in world coordinates, in the order of the nodes. Equal meshes are placed at once.
-
-    Meshes are equal if their morph targets have the same weights.
-    """
+    """The primitives of all nodes in world coordinates, in the order of the nodes. Equal meshes are placed at once."""
     matrices = [instance_matrices(document, node) for node in drawn]
     most = {mesh: max(len(primitive.targets) for primitive in listed) for mesh, listed in primitives.items() if listed}
+    # Meshes are equal if their morph targets have the same weights.
     shapes = [
         (mesh, morph_weights(document, node, mesh, most[mesh])) for node, mesh in zip(drawn, mesh_of, strict=True)
     ]
@@ -630,13 +628,7 @@ def _skins(
 
 
 def _geometry(document: Document, primitive: Primitive, weight: tuple[float, ...]) -> tuple[Geometry, Binding | None]:
-    """The triangles of a primitive (section 3.7.2), and the joints of its vertices.
-
-    Args:
-        document: The file.
-        primitive: The primitive.
-        weight: Weights of its morph targets.
-    """
+    """The triangles of a primitive (section 3.7.2) at weights of its morph targets, and the joints of its vertices."""
     face = _faces(document, primitive)
     if primitive.flat:
         used, face = face.ravel(), np.arange(face.size).reshape(-1, 3)
@@ -710,10 +702,8 @@ def _faces(document: Document, primitive: Primitive) -> np.ndarray:
 
 
 def _compact_vertices(face: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The vertices that triangles use, in ascending order, and the triangles as indices to these.
-
-    Thousands of primitives may share one array of vertices, so the work is in proportion to the triangles.
-    """
+    """The vertices that triangles use, in ascending order, and the triangles as indices to these."""
+    # Thousands of primitives may share one array of vertices, so the work is in proportion to the triangles.
     if count > 4 * face.size:
         used, dense = np.unique(face, return_inverse=True)
         return used, dense.reshape(-1, 3)

@@ -158,13 +158,7 @@ def _roots(document: Document) -> list[int]:
 
 
 def _tree_nodes(document: Document, roots: list, owner: str) -> list[Node]:
-    """The nodes of trees, parents before their children.
-
-    Args:
-        document: The file.
-        roots: Indices of the roots, as they stand in the file.
-        owner: The object that has these roots, for error messages.
-    """
+    """The nodes of trees, parents before their children, from the roots that `owner` has in the file."""
     items = document.items("nodes")
     order: list[int] = []
     parent: list[int] = []  # place of the parent in `order`; -1 for roots
@@ -188,14 +182,7 @@ def _tree_nodes(document: Document, roots: list, owner: str) -> list[Node]:
 
 
 def _in_world(document: Document, order: list[int], parent: list[int], level: list[int]) -> list[Node]:
-    """Nodes with their transforms to world coordinates.
-
-    Args:
-        document: The file.
-        order: Indices of the nodes, parents before their children.
-        parent: Place of each node's parent in `order`; -1 for roots.
-        level: Number of ancestors of each node.
-    """
+    """Nodes with their transforms to world coordinates; `parent` is a place in `order`, -1 for roots."""
     if not order:
         return []
     items = document.items("nodes")
@@ -385,14 +372,8 @@ def _channel_value(document: Document, sampler: Sampler, path: str, time: float)
 
 
 def _hermite(before: Sequence[np.ndarray], after: Sequence[np.ndarray], step: float, along: float) -> np.ndarray:
-    """The cubic spline between two keys, each with its in-tangent, its value and its out-tangent (appendix C.5).
-
-    Args:
-        before: The key before.
-        after: The key after.
-        step: Seconds between them, by which tangents are multiplied.
-        along: Fraction of the way from one to the other.
-    """
+    """The cubic spline between two keys, each with its in-tangent, its value and its out-tangent (appendix C.5)."""
+    # `along` is the fraction of the way, `step` the seconds between the keys, by which tangents are multiplied.
     square, cube = along**2, along**3
     start, end = 2 * cube - 3 * square + 1, 3 * square - 2 * cube
     leaving, entering = cube - 2 * square + along, cube - square

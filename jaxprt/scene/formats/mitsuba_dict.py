@@ -359,11 +359,9 @@ class MaterialMaker:
 
 
 def _roughness_and_anisotropy(along: float, across: float) -> dict[str, float]:
-    """Roughness and anisotropy from alpha along and across the direction of anisotropy; along >= across.
-
-    KHR_materials_anisotropy defines alpha_t = mix(alpha, 1, anisotropy^2) along and alpha_b = alpha across.
-    """
+    """Roughness and anisotropy from alpha along and across the direction of anisotropy; along >= across."""
     along = min(along, 1.0)
+    # KHR_materials_anisotropy defines alpha_t = mix(alpha, 1, anisotropy^2) along and alpha_b = alpha across.
     square = (along - across) / (1 - across) if across < 1 else 0.0
     return {"roughness": math.sqrt(across), "anisotropy": math.sqrt(max(square, 0.0))}
 

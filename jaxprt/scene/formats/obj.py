@@ -67,28 +67,16 @@ _BLENDER = re.compile(
 
 
 class _Rows(NamedTuple):
-    """The numbers of all statements of one kind.
-
-    Attributes:
-        value: The numbers [n k]; NaN where a row has fewer than others.
-        line: Index of the line of each row [n].
-    """
+    """The numbers [n k] of all statements of one kind, NaN where a row has fewer than others; and each row's line."""
 
     value: np.ndarray
     line: np.ndarray
 
 
 class _Faces(NamedTuple):
-    """Faces.
+    """The corners [c 3] of all faces, and the number of corners, the line and the region of each face."""
 
-    Attributes:
-        corner: Indices of the vertex, texture coordinates and normal of each corner [c 3].
-        size: Number of corners of each face [f].
-        line: Index of the line of each face [f].
-        region: Region of each face [f].
-    """
-
-    corner: np.ndarray
+    corner: np.ndarray  # indices of the vertex, texture coordinates and normal
     size: np.ndarray
     line: np.ndarray
     region: np.ndarray
@@ -161,11 +149,7 @@ def read(path: pathlib.Path, *, groups: bool) -> MeshContent:
 
 
 def _statements(source: _Source, *, groups: bool) -> tuple[list[_Rows], _Faces, set[str]]:
-    """Reads all statements in blocks of lines, so that not all words are in memory at once.
-
-    Returns:
-        The numbers of v, vt and vn; the faces; and the names of statements that are not read.
-    """
+    """Reads the numbers of v, vt and vn, the faces, and the names of statements that are not read."""
     rows: dict[bytes, list[_Rows]] = {kind: [] for kind in _LEAST}
     faces: list[_Faces] = []
     regions: dict[tuple[str, ...], int] = {}
@@ -173,6 +157,7 @@ def _statements(source: _Source, *, groups: bool) -> tuple[list[_Rows], _Faces, 
     names = {b"o": "", b"g": ""} if groups else {b"usemtl": ""}
     region, start = -1, 0
     stream = io.BytesIO(source.content)
+    # In blocks of lines, so that not all words are in memory at once.
     while lines := list(itertools.islice(stream, _BLOCK)):
         tails: dict[bytes, list[bytes]] = {kind: [] for kind in (*_LEAST, b"f")}
         places: dict[bytes, list[int]] = {kind: [] for kind in tails}
@@ -273,11 +258,7 @@ def _whole(word: bytes) -> int:
 
 
 def _absolute_indices(faces: _Faces, rows: list[_Rows], source: _Source) -> _Faces:
-    """Faces with indices from 0. Indices are -1 where a face has none or refers to something that does not exist.
-
-    Raises:
-        ValueError: A face has fewer than three corners or refers to a vertex that does not exist.
-    """
+    """Faces with indices from 0; -1 where a face has none or refers to something that does not exist."""
     index = faces.corner
     for column, row in enumerate(rows):
         number = index[:, column]
@@ -396,13 +377,10 @@ def materials_of_regions(
 
 
 def _exponent(line: str) -> float | None:
-    """The exponent Ns that this version of Blender writes for a roughness of 0, from the first line of the OBJ file.
-
-    None for other programs, and for Blender before 2.80, which had Phong materials.
-    """
+    """The Ns that Blender writes for a roughness of 0, by the first line of the OBJ file; None for other programs."""
     match = _BLENDER.match(line)
     if match is None or (version := (int(match[2]), int(match[3]))) < (2, 80):
-        return None
+        return None  # Blender before 2.80 had Phong materials
     return 1000.0 if version >= (3, 3) and not match[1] else 900.0
 
 
@@ -567,14 +545,9 @@ def _layers(value: dict[str, Any], ignored: set[str]) -> dict[str, Any]:
 
 
 def _unread_light(statements: dict[str, list[str]], value: dict[str, Any], transparent: bool) -> set[str]:
-    """What passes through a surface and is not read: refraction, and its color.
-
-    Args:
-        statements: The statements of a material.
-        value: Their numbers.
-        transparent: Whether illum 4 to 9 only say that the surface is transparent, as Blender writes them.
-    """
+    """What passes through a surface and is not read: refraction, and its color."""
     model, ignored = value.get("illum", 2), set()
+    # With `transparent`, illum 4 to 9 only say that the surface is transparent, as Blender writes them.
     if model in _REFRACTING and not transparent:
         ignored.add(f"illum {model:g} (glass: nothing is refracted, and only d, Tr and map_d let light through)")
     elif model not in _REFLECTING | _REFRACTING:
@@ -586,10 +559,8 @@ def _unread_light(statements: dict[str, list[str]], value: dict[str, Any], trans
 
 
 def _principled(value: dict[str, Any], stated: Collection[str], exponent: float) -> dict[str, Any]:
-    """Factors of Blender's principled material, from the values that Blender's exporter writes.
-
-    Blender's importer uses the same inverse: source/blender/io/wavefront_obj/importer/obj_import_mtl.cc.
-    """
+    """Factors of Blender's principled material, from the values that Blender's exporter writes."""
+    # Blender's importer uses the same inverse: source/blender/io/wavefront_obj/importer/obj_import_mtl.cc.
     shine = min(max(value.get("Ns", 0.0) / exponent, 0.0), 1.0)
     metallic = min(max(value.get("Ka", 0.0), 0.0), 1.0) if value.get("illum", 2) in (3, 6) else 0.0
     specular = value.get("Ks", np.full(3, 0.5))
@@ -642,10 +613,7 @@ def _add_map(
     ignored: set[str],
     pictures: TextureImages,
 ) -> None:
-    """Adds the texture of a statement. If it cannot be read, adds the reason to `ignored`.
-
-    The opacity of map_d is the alpha of an image that has one, and otherwise its first channel.
-    """
+    """Adds the texture of a statement. If it cannot be read, adds the reason to `ignored`."""
     name, channels, decoded = _MAPS.get(key, _MAPS["norm"])
     chosen = _SCALARS.get(" ".join(options.get("-imfchan", []))) if len(channels) == 1 else None
     try:
@@ -653,6 +621,7 @@ def _add_map(
         if absence:
             raise ValueError(f"{file}, {absence}")
         image = pictures.read(file, chosen or channels, decoded=decoded)
+        # The opacity of map_d is the alpha of an image that has one, and otherwise its first channel.
         if key == "map_d" and chosen is None and np.min(image) == 1:
             image = pictures.read(file, (0,), decoded=False)
         if key in _BUMPS and not _holds_normals(np.asarray(image)):

@@ -398,12 +398,7 @@ def _faces(face: Columns, table: dict[str, Columns]) -> tuple[Polygons, int]:
 
 
 def _strip_triangles(vertex: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Triangles [t 3] of strips, which start again after each -1. Every second triangle of a strip is reversed.
-
-    Args:
-        vertex: Vertex indices of all strips, one strip after the other.
-        length: Number of indices of each strip.
-    """
+    """Triangles [t 3] of strips, which start again after each -1. Every second triangle of a strip is reversed."""
     vertex = np.insert(vertex, np.cumsum(length)[:-1], -1)
     place = np.arange(len(vertex))
     start = np.maximum.accumulate(np.where(vertex < 0, place + 1, 0))
@@ -417,17 +412,7 @@ def _strip_triangles(vertex: np.ndarray, length: np.ndarray) -> np.ndarray:
 def _ply_content(
     position: np.ndarray, vertex: Columns, face: Columns, faces: Polygons, corners: int, images: list[str], name: str
 ) -> MeshContent:
-    """The geometry, images and what is ignored.
-
-    Args:
-        position: Vertex positions [v 3].
-        vertex: The table of vertices.
-        face: The table of faces.
-        faces: All faces, those of strips last.
-        corners: Number of corners of faces that are not of strips.
-        images: Names of the image files.
-        name: Name of the file.
-    """
+    """The geometry, images and what is ignored; the faces of strips come last, after `corners` corners of others."""
     of_vertex = {"normal": _side_by_side(vertex, ("nx", "ny", "nz"))}
     of_vertex["texture"] = next(
         (value for names in _TEXTURE if (value := _side_by_side(vertex, names)) is not None), None

@@ -143,20 +143,12 @@ def _job(
 
 
 class _Exchange(NamedTuple):
-    """Makes the patches of a scene.
+    """Makes the patches of a scene."""
 
-    Attributes:
-        mesh: The whole scene.
-        job: The job of one bounce.
-        wanted: Approximate number of patches.
-        bounces: Total number of bounces; None for all.
-        run: Where the work is computed and stored.
-    """
-
-    mesh: Mesh
-    job: jobs.TransferJob
-    wanted: int
-    bounces: int | None
+    mesh: Mesh  # the whole scene
+    job: jobs.TransferJob  # of one bounce
+    wanted: int  # approximate number of patches
+    bounces: int | None  # total number; None for all
     run: Run
 
     def make(
@@ -264,10 +256,7 @@ def _check_sizes(
 def _responses(
     mesh: Mesh, bases: Sequence, kind: np.ndarray, edge: int, lamps: LampTransport | None, run: Run
 ) -> tuple[np.ndarray, ...]:
-    """Response of the light factors of each basis to each texel of the environment, and to each lamp.
-
-    `kind` is the index of the basis of each vertex.
-    """
+    """Response of the light factors of each basis to each texel of the environment, and to each lamp."""
     result, count = [], 0 if lamps is None else lamps.lamps
     for number, basis in enumerate(bases):
         vertex = np.flatnonzero(kind == number)

@@ -63,34 +63,21 @@ class ResponseJob(visibility.rays.VisibilityJob):
 
 @dataclass(frozen=True)
 class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
-    """Light that surfaces of all regions send to the vertices of each cluster; see `blocks.Job`.
+    """Light that surfaces of all regions send to the vertices of each cluster; see `blocks.Job`."""
 
-    Attributes:
-        bases: Functions of the regions. Regions may share them.
-        basis: Index of the functions of each region.
-        response: For each of the bases, responses of its light factors at the vertices of all its regions, padded to a
-            size that scenes share; the light is the last axis: texels of the environment, and then lamps.
-        lamps: Number of lamps.
-        white: Weights of all functions with which the worth of a bounce is estimated.
-        scale: Weights of all functions in the errors of decompositions.
-        function: Indices of the functions that are computed.
-        region: Index of each vertex's region.
-        member: Vertices of each cluster.
-        components: Number of principal components over the vertices of a cluster.
-        modes: Number of principal components over the light.
-    """
-
-    bases: tuple[SeparableBrdf, ...]
-    basis: np.ndarray
+    bases: tuple[SeparableBrdf, ...]  # functions of the regions, which may share them
+    basis: np.ndarray  # index of the functions of each region
+    # For each basis, at the vertices of all its regions, padded to a size that scenes share: the responses of its light
+    # factors, with the light as the last axis, texels of the environment and then lamps.
     response: tuple[np.ndarray, ...]
     lamps: int
-    white: np.ndarray
-    scale: np.ndarray
-    function: np.ndarray
-    region: np.ndarray
-    member: np.ndarray
-    components: int
-    modes: int
+    white: np.ndarray  # weights of all functions with which the worth of a bounce is estimated
+    scale: np.ndarray  # weights of all functions in the errors of decompositions
+    function: np.ndarray  # indices of the functions that are computed
+    region: np.ndarray  # of each vertex
+    member: np.ndarray  # vertices of each cluster
+    components: int  # principal components over the vertices of a cluster
+    modes: int  # principal components over the light
     system: ClassVar[str] = "transfer"
 
     @property
@@ -105,12 +92,10 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
 
     @functools.cached_property
     def reduced(self) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-        """Responses [v k m] to orthonormal modes m of the light, then lamps; and the modes [l m].
-
-        The modes are principal components of the responses, in columns l that matter alike. They are fewer than these,
-        one and a half times as many as the decomposition keeps, and gathering takes as much less time.
-        """
+        """Responses [v k m] to orthonormal modes m of the light, then lamps; and the modes [l m]."""
         forward, _ = self.spectrum
+        # The modes are principal components of the responses: one and a half times as many as the decomposition keeps,
+        # but fewer than the columns, and gathering takes as much less time.
         columns, count = len(forward), self.modes * 3 // 2
         mode = np.eye(columns)
         if count < columns:
@@ -121,10 +106,7 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
         return tuple(rows), mode.astype(np.float32)
 
     def _products(self, forward: np.ndarray) -> np.ndarray:
-        """Products [l l] of columns of the light, summed over the responses of a sample of vertices.
-
-        Responses are divided by the size of their vertex's: dim corners of a scene count as bright places do.
-        """
+        """Products [l l] of columns of the light, summed over the responses of a sample of vertices."""
         result = np.zeros((len(forward), len(forward)))
         for number, (basis, response) in enumerate(zip(self.bases, self.response, strict=True)):
             strength = np.sqrt(np.mean(np.square(np.asarray(basis.view_map)), (1, 2, 3)))
@@ -133,6 +115,7 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
             rows = response[sample, :, : len(forward)] @ forward * strength[:, None]
             size = np.sum(rows**2, (1, 2))
             size = np.sqrt(size + _DIM**2 * max(np.mean(size), np.finfo(np.float32).tiny))
+            # Responses are divided by the size of their vertex's: dim corners of a scene count as bright places do.
             flat = (rows / size[:, None, None]).reshape(-1, len(forward))
             result += flat.T @ flat
         return result
@@ -456,9 +439,7 @@ def _scaled(vertex: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 @jit
 def _expand(weight: Array, core: Array, coarse: Array) -> Array:
-    """Light that arrives at the vertices of a cluster from each coarse texel and function, [harmonic, l q, vertex].
-
-    For lamps, `coarse` is the identity.
-    """
+    """Light that arrives at the vertices of a cluster from each coarse texel and function, [harmonic, l q, vertex]."""
+    # For lamps, `coarse` is the identity.
     sent = jnp.einsum("le,ensq->nslq", coarse, core.astype(weight.dtype))
     return jnp.einsum("mn,nslq->slqm", weight, sent).reshape(core.shape[2], -1, len(weight))

@@ -146,15 +146,13 @@ class DynamicSystem(protocol.VertexSystem):
 
 @jit
 def _direction(position: Array, frame: Array, points: Points | None, eye: Array) -> Float[Array, "v 3"]:
-    """Directions to the viewer in the frames of the light factors.
-
-    Points whose normals are tilted by a normal map have light factors in the frames without it. There they are seen
-    from where the mirror direction of the tilted normal is also that of the frame.
-    """
+    """Directions to the viewer in the frames of the light factors."""
     place, axes = placed(position, frame, points)
     wo = directions.view(axes, place, eye)
     if points is None or points.normal is None:
         return wo
+    # Light factors are in frames without the normal map. Points are seen from where the mirror direction of the tilted
+    # normal is also that of the frame.
     smooth = points.tilted(None).frame(frame)
     mirror = jnp.einsum("vi,vij->vj", wo * jnp.array([-1.0, -1.0, 1.0], wo.dtype), axes, precision="highest")
     return jnp.einsum("vij,vj->vi", smooth, mirror, precision="highest") * jnp.array([-1.0, -1.0, 1.0], wo.dtype)

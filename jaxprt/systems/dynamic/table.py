@@ -271,13 +271,11 @@ def _weighted(tensor: Array, weight: Array, inside: Array) -> tuple[Array, Array
 
 @jit
 def _maps(least: tucker.Tucker, flat: Array, seen: Array, rest: Reflected, inside: Array) -> tuple[Array, ...]:
-    """Maps of a decomposition. Views, and then light, are the least-squares solution for fixed other factors.
-
-    View maps also cover texels of zero weight.
-    """
+    """Maps of a decomposition. Views, and then light, are the least-squares solution for fixed other factors."""
     core, (along, _, across), weight = least.core, least.factor, jnp.sqrt(rest.area)
     by_view = tucker.multiply(tucker.multiply(flat, across, mode=2), along, mode=0)  # [h, d, i]
     unfolded = core.transpose(1, 0, 2).reshape(core.shape[1], -1)
+    # View maps also cover texels of zero weight.
     view = jnp.moveaxis(by_view, 1, 0).reshape(len(weight), -1) @ jnp.linalg.pinv(unfolded, rtol=_RANK)
     sent = jnp.einsum("mh,hoi,do->mdi", along, core, view * weight[:, None])[:, inside]
     square = jnp.einsum("mdi,mdj->ij", sent, sent)

@@ -255,11 +255,7 @@ def _project(brdf: Callable, wo: Array, degree: int, rule: tuple[int, int]) -> n
 def _table(
     models: Sequence[Callable], points: Sequence[tuple], knots: tuple, wo: Array, degree: int, rule: tuple[int, int]
 ) -> HarmonicBrdf:
-    """The table of BRDFs at the view nodes `wo` [*q 3], with an error of NaN. Gray BRDFs are repeated to all colors.
-
-    Raises:
-        ValueError: A BRDF returns values that are not finite.
-    """
+    """The table of BRDFs at the view nodes `wo` [*q 3], with an error of NaN. Gray BRDFs are repeated to all colors."""
     tables = [_project(model, wo.reshape(-1, 3), degree, rule) for model in models]
     for point, table in zip(points, tables, strict=True):
         if not np.isfinite(table).all():

@@ -220,10 +220,8 @@ def mean_density(mean: Array, concentration: Array, toward: Sequence[Array], cho
 
 
 def _inside(size: Array, offset: Array) -> Array:
-    """Probability that a noncentral chi-squared variable with two degrees of freedom is at most `size`.
-
-    Reference: Sankaran, "Approximations to the non-central chi-square distribution", Biometrika 1963.
-    """
+    """Probability that a noncentral chi-squared variable with two degrees of freedom is at most `size`."""
+    # Sankaran, "Approximations to the non-central chi-square distribution", Biometrika 1963.
     first, second, third = 2 + offset, 2 + 2 * offset, 2 + 3 * offset
     h = 1 - 2 * first * third / (3 * second**2)
     p = second / first**2

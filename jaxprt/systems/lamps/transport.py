@@ -141,15 +141,12 @@ def _relative(lamp: Mesh | PointLight, origin: origins.Origin) -> Mesh | PointLi
 
 
 class _Samples(NamedTuple):
-    """Sample points on all lamps, the area of each times the normal there, and the number of points of each piece.
-
-    The spots among the lamps stand with the index of their one sample.
-    """
+    """Sample points on all lamps, the area of each times the normal there, and the number of points of each piece."""
 
     place: np.ndarray
     area: np.ndarray
     piece: np.ndarray
-    spot: Sequence[tuple[int, PointLight]]
+    spot: Sequence[tuple[int, PointLight]]  # the spots among the lamps, with the index of their one sample
 
     @classmethod
     def of(cls, lamps: Sequence[Mesh | PointLight], count: int, pieces: int) -> "_Samples":

@@ -144,15 +144,12 @@ def _edge(width: float, size: int, *, least: int) -> int:
 
 
 def _blurs(radiance: Float[Array | np.ndarray, "6 n n c"]) -> Sequence[tuple[Array | np.ndarray, Array | np.ndarray]]:
-    """For each width, source texels [tile, m, face] of each tile of the blurred faces, and their weights [tile, o, m].
-
-    Each tile of blurred texels o is one small dense product with its m source texels. Weights are the same on all
-    faces. They are cached on the light's device; inside a compiled program they are constants.
-    """
+    """For each width, source texels [tile, m, face] of tiles of the blurred faces, and their weights [tile, o, m]."""
     with jax.ensure_compile_time_eval():  # Traced arrays could not be cached.
+        # Each tile of blurred texels o is one small dense product with m source texels. All faces have equal weights.
         size, dtype = radiance.shape[1], str(radiance.dtype)
         if isinstance(radiance, np.ndarray | Tracer):
-            return _host_blurs(size, dtype)
+            return _host_blurs(size, dtype)  # inside a compiled program they are constants
         return _device_blurs(size, dtype, min(radiance.devices(), key=lambda device: device.id))
 
 

@@ -126,17 +126,10 @@ def _columns(value: Array, count: int) -> Array:
 
 @partial(isolated, static=("size",))
 def _addresses(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> tuple[Array, Array, tuple]:
-    """Addresses of the bytes that each lobe reads: 3 x 3 texels at two scales, by rows.
-
-    An address is the sum of one number for each of the three rows and one for each of the three columns. So is the bit,
-    for scales stored as bits.
-
-    Returns:
-        Numbers of the rows and of the columns [b 2 3 l m] for both scales; and those of the bits, first of all rows and
-        then of all columns of each scale.
-    """
+    """Row and column numbers [b 2 3 l m] of the bytes that each lobe reads, 3 x 3 texels at two scales; and of bits."""
     scale = scales(size)
     number, _ = between(scale, spread)
+    # An address is the sum of one number for its row and one for its column. So is the bit, for scales stored as bits.
     address, bit = [], []
     for step in (0, 1):
         edge, start = (jnp.asarray(x)[number + step] for x in (scale.edge, scale.start))
@@ -193,19 +186,7 @@ def _decode(
 
 
 def _smooth(seen: Callable[[int, int], Array], edge: Array, s: Array, t: Array, *, rim: Array) -> list[Array]:
-    """Quadratic B-spline over 3 x 3 texels, and its derivatives with respect to s and t.
-
-    A border texel holds the texel of the neighboring face in the same row. Lines of constant t have a kink of slope t
-    at that edge, so that slopes across the edge would differ between the faces. The texel that continues the face
-    lies t / edge farther inside; its difference along the edge is taken off the slopes, which makes them continuous.
-
-    Args:
-        seen: Values of the texels, by row and column.
-        edge: Number of texels along the edge of a face.
-        s: Column coordinate.
-        t: Row coordinate.
-        rim: Whether faces have borders.
-    """
+    """Quadratic B-spline over 3 x 3 texels, and its derivatives with respect to s and t."""
     half = edge.astype(s.dtype) / 2
     (down, by_down, outside_down), (right, by_right, outside_right) = (_spline(edge, x, rim) for x in (t, s))
     total, by_s, by_t = [jnp.zeros_like(s)] * 3
@@ -215,6 +196,8 @@ def _smooth(seen: Callable[[int, int], Array], edge: Array, s: Array, t: Array, 
         parts = [x * w for x, w in zip(column, by_down, strict=True)]
         slope = parts[0] + parts[1] + parts[2]
         outside = parts[0] * outside_down[0] + parts[2] * outside_down[1]
+        # A border texel holds the next face's in the same row, but lines of constant t have a kink of slope t there.
+        # The texel that continues the face is t / edge farther in: its difference is taken off, for continuous slopes.
         across = mean if j == 1 else mean - slope * (outside_right[j // 2] * t / 2)
         total = total + mean * right[j]
         by_s = by_s + across * by_right[j]
@@ -238,14 +221,11 @@ def _nearest(edge: Array, x: Array) -> Int[Array, "..."]:
 
 
 def _level(byte: UInt8[Array, "..."], bit: Array, number: Array, *, bits: int) -> Int[Array, "..."]:
-    """Visibility that a byte encodes, in units of `_levels`.
-
-    It is one bit at scale 0, the sum of four bits at scale 1, and a mean as byte beyond. `bits` is the number of scales
-    that are read from bits.
-    """
+    """Visibility that a byte encodes, in units of `_levels`; the first `bits` scales are read from bits."""
     value = byte.astype(jnp.int32)
     if not bits:
         return value
+    # One bit at scale 0, the sum of four bits at scale 1, and a mean as byte beyond.
     four = value >> bit & jnp.where(number == 0, 1, 15)
     pair = (four & 5) + (four >> 1 & 5)
     return jnp.where(number < bits, (pair & 3) + (pair >> 2), value)

@@ -186,22 +186,11 @@ class LobeBrdf(eqx.Module):
 
 @jit
 def _mean(table: LobeBrdf, weight: Float[Array, " m"]) -> LobeBrdf:
-    """Weighted mean of the lobes along the first parameter axis of a table, which is removed.
-
-        w = sum_h a_h w_h,    (m, log k) = sum_h a_h w_h (m_h, log k_h) / w
-
-    The weights a sum to one. Directions and widths are also weighted by the lobe's own weight w_h, so that an entry in
-    which the lobe has zero weight does not affect them.
-
-    Args:
-        table: The table.
-        weight: Weight a of each entry along the first parameter axis.
-
-    Raises:
-        ValueError: The number of weights differs from the number of entries.
-    """
+    """Mean of the lobes, by weights of sum one, along the first parameter axis of a table, which is removed."""
     if weight.shape != table.scale.shape[1:2]:
         raise ValueError(f"weights must be one for each of {table.scale.shape[1]} BRDFs, got {list(weight.shape)}")
+    # w = sum_h a_h w_h, (m, log k) = sum_h a_h w_h (m_h, log k_h) / w for weights a. An entry in which the lobe has
+    # zero weight does not affect directions and widths.
     weight = weight.reshape(-1, *[1] * (table.scale.ndim - 2))
     part = jnp.maximum(weight * jnp.sum(table.weight, 0), 0) + _TINY
     part = part / jnp.sum(part, 1, keepdims=True)
@@ -315,14 +304,11 @@ def _stack(tables: list, knots: tuple, nodes: tuple[int, ...]) -> LobeBrdf:
 
 
 def _tables(samples: list[tuple[Array, ...]], wo: Array, size: tuple[int, ...], *, lobes: int) -> list[tuple]:
-    """Means, logarithms of concentrations, weights and diffuse albedos of each BRDF at the view nodes `wo` [*q 3].
-
-    The BRDFs are those at the knots of the parameters, of which there are `size` along each axis. EM runs for one BRDF
-    at a time; smoothing between the rounds is along the parameters too.
-    """
+    """Means, logarithms of concentrations, weights and diffuse albedos of each BRDF at the view nodes `wo` [*q 3]."""
     nodes, view = wo.shape[:-1], np.asarray(wo).reshape(-1, 3)
     state = [_begin(view, sample, mass, lobes=lobes) for sample, mass, _, _ in samples]
     lobe, weight = [knot[1] for knot in state], [knot[3] for knot in state]
+    # EM runs for one BRDF at a time; smoothing is along the parameters too, which have `size` knots.
     for times, smoothing in _ROUNDS:
         for number, (sample, _, fixed, extent) in enumerate(samples):
             gray, _, least, _ = state[number]
@@ -449,16 +435,10 @@ class _Entry(NamedTuple):
 
 
 def _entries_between(row: Float[Array, "r *q"], knot: list, axis: list, *, lobes: int) -> _Entry:
-    """Interpolates the rows of a table for views v with their own parameters: between knots first, then between nodes.
-
-    Args:
-        row: Means, logarithms of concentrations, weights and diffuse albedos [r] of all lobes, at all knots and nodes.
-        knot: For each parameter, the index of the lower knot and the weight of the upper one, for each view.
-        axis: For each axis of view nodes, the index of the lower node and the weight of the upper one, for each view.
-        lobes: Number of lobes.
-    """
+    """Interpolates rows of a table for views with their own parameters: between knots first, then between nodes."""
     sizes = row.shape[1:]
     place, share = [], []
+    # `knot` and `axis` have the index of the lower knot or node and the weight of the upper one, for each view.
     for corner in itertools.product((0, 1), repeat=len(axis)):
         pairs = list(zip(corner, axis, strict=True))
         share.append(math.prod((upper if up else 1 - upper for up, (_, upper) in pairs), start=jnp.ones((), row.dtype)))

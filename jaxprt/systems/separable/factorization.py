@@ -382,13 +382,10 @@ def light_covariance(direction: Float[Array, "d 3"], *, degree: int) -> Float[Ar
 def _leading(
     matrix: Array, covariance: Array, terms: int | None, error: float | None
 ) -> tuple[Array, Array, np.ndarray, int]:
-    """Squared singular values, singular vectors, errors by number of terms, and the number of terms requested.
-
-    The number of terms is `terms`, or the smallest that meets the error. With `terms`, a few more values and vectors
-    are returned, because terms with equal singular values must be oriented together.
-    """
+    """Squared singular values, singular vectors, errors by number of terms; `terms` or the least that meet `error`."""
     total = _total(matrix, covariance)
     most = min(_MOST_TERMS, matrix.shape[1])
+    # With `terms`, a few more, because terms with equal singular values must be oriented together.
     count = min(4, most) if terms is None else min(terms + _MORE, *matrix.shape)
     while True:
         value, vector, _ = eigen.left_singular(matrix, metric=covariance, terms=count)

@@ -36,23 +36,15 @@ _VIEWS = np.sqrt((np.arange(16) + 0.5) / 16)  # cosines of views, uniform in pro
 
 
 class _Layer(NamedTuple):
-    """What lies over a material.
+    """What lies over a material."""
 
-    Attributes:
-        first: Index of the first of its coefficients.
-        table: The table with the lobe of the layer.
-        channel: Index of its channel there.
-        loss: Share of the light that a full layer takes from what is under it, at cosines of views, for each
-            roughness: a function of the cosines and of the logarithms of the roughness.
-        reflects: Whether the lobe of the table, of albedo 1, is to be multiplied by that share. The lobe of a sheen
-            has its own albedo.
-    """
-
-    first: int
-    table: StandardTable
-    channel: int
+    first: int  # index of the first of its coefficients
+    table: StandardTable  # with the lobe of the layer
+    channel: int  # index in the table
+    # Share of the light that a full layer takes from what is under it: a function of the cosines of views and of the
+    # logarithms of the roughness.
     loss: Callable[[Float[np.ndarray, " v"], Float[np.ndarray, " n"]], Float[np.ndarray, "n v"]]
-    reflects: bool
+    reflects: bool  # whether that share multiplies the lobe, of albedo 1; the lobe of a sheen has its own albedo
 
     def lobe_factor(self, loss: Float[np.ndarray, "..."] | np.floating) -> Float[np.ndarray, "..."] | np.floating:
         """Factor of the lobe of the table for the loss of what is under it."""
