@@ -202,6 +202,26 @@ def test_functions_have_one_idea():
     assert not long, f"lines without docstrings, at most {MOST_LINES_OF_A_FUNCTION}: {long}"
 
 
+def private(node: ast.AST) -> Iterator[ast.FunctionDef | ast.ClassDef]:
+    """Private functions and classes, with all inside of them."""
+    for child in ast.iter_child_nodes(node):
+        named = isinstance(child, ast.FunctionDef | ast.ClassDef)
+        if named and child.name.startswith("_") and not child.name.startswith("__"):
+            yield from (each for each in ast.walk(child) if isinstance(each, ast.FunctionDef | ast.ClassDef))
+        else:
+            yield from private(child)
+
+
+def test_docstrings_of_private_functions_are_a_line():
+    long = {
+        f"{module}.{function.name}"
+        for module in TEXTS
+        for function in private(ast.parse(TEXTS[module]))
+        if "\n" in (ast.get_docstring(function) or "")
+    }
+    assert not long
+
+
 def fillers(nodes: Iterable[ast.AST]) -> Iterator[str]:
     """Fillers that a module binds as names of variables, arguments or loop targets, with their lines."""
     for node in nodes:
