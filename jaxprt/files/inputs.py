@@ -16,8 +16,8 @@ _SHOWN = 400  # characters of a name in messages; what is longer is data
 
 
 def shortened(text: object) -> str:
-    """A name or a path for a message, without the middle of a very long one, such as a URI that holds data."""
-    words = str(text)
+    """A name or a path for a message: one line, without the middle of a long one, such as a URI that holds data."""
+    words = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(text))
     return words if len(words) <= _SHOWN else f"{words[: _SHOWN // 2]}...{words[-_SHOWN // 4 :]}"
 
 

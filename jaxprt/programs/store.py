@@ -32,8 +32,8 @@ log = logging.getLogger("jaxprt")
 
 
 def is_enabled() -> bool:
-    """Whether programs are kept: not if JAXPRT_KEEP_PROGRAMS is 0, nor for a processor that cannot be named."""
-    return os.environ.get("JAXPRT_KEEP_PROGRAMS", "1") != "0" and bool(processor())
+    """Whether programs are kept: not if JAXPRT_KEEP_PROGRAMS is 0 or false, nor for unnamed processors."""
+    return os.environ.get("JAXPRT_KEEP_PROGRAMS", "1").strip().lower() not in ("0", "false") and bool(processor())
 
 
 def folder() -> pathlib.Path:

@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 from threadpoolctl import threadpool_limits
 
+from jaxprt import require
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import Between, finished
 from jaxprt.image import Pixels, front, raster, relative_l2, resolve
@@ -117,6 +118,7 @@ def exact_pixels(
         between: Function that is called after each stage and after each block of 64 points, by several threads. If it
             raises an exception, the computation stops.
     """
+    check(scene, shadings, environments, camera)
     scene, camera = _near(scene, camera)
     mesh, lights = scene.mesh, Environment(jnp.stack([light.radiance for light in environments]))
     fine = dataclasses.replace(camera, width=_SIDE * camera.width, height=_SIDE * camera.height)
@@ -160,6 +162,19 @@ def exact_pixels(
     return ExactPixels(pixel, shown[pixel], mean, weight, error / np.where(norm > 0, norm, 1))
 
 
+def check(scene: Any, shadings: Sequence[Any], environments: Sequence[Any], camera: Any) -> None:
+    """Refuses what is not a scene with a shading for each part, one or more lights of one size, and a camera."""
+    require.kind("the scene", scene, Scene, source="jaxprt.load_scene")
+    require.kind("the camera", camera, Camera, source="jaxprt.Camera")
+    if len(shadings) != len(scene.parts):
+        raise ValueError(f"there must be a shading for each of {len(scene.parts)} parts, got {len(shadings)}")
+    for light in environments:
+        require.kind("a light", light, Environment, source="jaxprt.scene.load_environment")
+    sizes = {light.radiance.shape for light in environments}
+    if len(sizes) != 1:
+        raise ValueError(f"there must be one or more lights of one size, got {sorted(sizes) or 'none'}")
+
+
 def exact_picture(
     scene: Scene,
     shadings: Sequence[Shading],
@@ -186,10 +201,11 @@ def exact_picture(
         between: Function that is called between steps of the work, as in `exact_pixels`.
 
     Raises:
-        ValueError: `most` is below 1.
+        TypeError: An argument is of another kind.
+        ValueError: `most` is below 1, there is no light, lights have different sizes, or a part has no shading.
     """
-    if most < 1:
-        raise ValueError(f"most must be at least 1 point, got {most}")
+    check(scene, shadings, environments, camera)
+    require.number("most", most, 1.0)
     whole, asked = scene, camera
     scene, camera = _near(scene, camera)
     shown = finished(_PicturePoints.of(scene, camera), between)
@@ -219,6 +235,8 @@ def exact_picture(
     surfaces, empty = [resolve(shown.pixels, light) for light in color], np.asarray(shown.pixels.background)
     alpha = 1 - (empty if empty.ndim == 2 else empty.mean(-1))
     few = max(_FEWEST, int(np.sum(shown.owner >= 0)) // _PER_PIXEL)
+    if not alpha.any():
+        return ExactPicture(asked, np.stack(pictures), np.stack(surfaces), alpha, np.zeros(len(pictures)))
     others = exact_pixels(whole, shadings, environments, asked, pixels=few, importance=importance(pictures), **options)
     error = [others.relative_l2(picture, light=light)[0] for light, picture in enumerate(pictures)]
     return ExactPicture(asked, np.stack(pictures), np.stack(surfaces), alpha, np.array(error))

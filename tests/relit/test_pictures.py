@@ -270,8 +270,22 @@ def test_the_exact_picture_has_rays_from_its_own_points_on_matte_parts_too():
     matted, floor = scene(floor=Lambert(0.5)), Lambert(0.5)
     shadings = [channels.of_part(part) for part in matted.parts]
     camera = dataclasses.replace(CAMERA, width=2 * CAMERA.width, height=2 * CAMERA.height)
-    with pytest.raises(ValueError, match="most must be at least 1 point, got 0"):
-        exact_picture(matted, shadings, [light()], camera, most=0)
+    lights = [light()]
+    for arguments, most, message in (
+        ((matted, shadings, lights, camera), 0, "most must be at least 1 and at most .*, got 0"),
+        ((matted, shadings, [], camera), 400, "there must be one or more lights of one size, got none"),
+        (
+            (matted, shadings, [*lights, Environment(jnp.ones((6, 4, 4, 3)))], camera),
+            400,
+            "one or more lights of one size, got .*, ",
+        ),
+        ((matted, shadings[:1], lights, camera), 400, "a shading for each of 2 parts, got 1"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            exact_picture(*arguments, most=most)
+    away = dataclasses.replace(camera, target=2 * np.asarray(camera.eye) - np.asarray(camera.target))
+    empty = exact_picture(matted, shadings, lights, away)
+    assert (empty.alpha.max(), empty.error.max()) == (0, 0)
     found = exact_picture(matted, shadings, [light()], camera, most=400)
     height, width = found.color.shape[1:3]
     assert (found.camera.width, found.camera.height) == (width, height)

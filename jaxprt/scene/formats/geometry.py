@@ -16,6 +16,7 @@ _REVERSED = 1e-9  # area of a triangle of the other orientation, relative to the
 _ROUNDED = 64 * np.finfo(np.float64).eps  # height of a triangle that is rounding error, relative to its coordinates
 _FLAT = 1e-12  # volume of a unit cube below which a transform has flattened it
 _DISPLAY_MOST = 255.0  # largest value in files that write the whole numbers of 8-bit colors as other types
+_BEYOND = 0.01  # by which colors may leave 0 to 1
 _PAINTED_MOST = 2.0  # largest float that counts as a color above white, such as 1 and rounding
 
 
@@ -439,12 +440,35 @@ def _areas(point: np.ndarray, triangle: np.ndarray, normal: np.ndarray) -> np.nd
     return np.where(triangle[..., 0] < 0, 0, area)
 
 
+def _are_bytes(value: np.ndarray) -> bool:
+    """Whether floats are colors between 0 and 255."""
+    finite = value[np.isfinite(value)]
+    if not _PAINTED_MOST < finite.max(initial=0) <= _DISPLAY_MOST:
+        return False
+    return bool((finite == np.round(finite)).all() or np.median(finite[finite > 0]) > _PAINTED_MOST)
+
+
+def translucent(alpha: np.ndarray) -> bool:
+    """Whether opacities of a mesh file are to be seen. Programs that have none write 0 or the largest everywhere."""
+    plain = (0, 1, _DISPLAY_MOST) if alpha.dtype.kind == "f" else (0, -1, _DISPLAY_MOST, np.iinfo(np.uint16).max)
+    return bool(len(alpha) and not ((alpha == alpha[0]).all() and alpha[0] in plain))
+
+
+def beyond_range(value: np.ndarray) -> set[str]:
+    """What is ignored of colors that `linear_color` clamps."""
+    finite = value[np.isfinite(value)].astype(np.float64)
+    most = _DISPLAY_MOST if _are_bytes(finite) else _PAINTED_MOST
+    wrong = value.dtype.kind == "f" and (finite.min(initial=0) < -_BEYOND or finite.max(initial=0) > most)
+    return {"colors below 0 or above 1"} if wrong else set()
+
+
 def linear_color(value: np.ndarray) -> np.ndarray:
     """Converts colors of a mesh file to linear values.
 
     Integers of 16 bits without a sign are divided by 65535, other integers by 255. Floats are between 0 and 1, or
-    between 0 and 255 if one of them is above 2; values a little above 1 are white. The result is decoded from sRGB: the
-    formats do not state what colors mean, and MeshLab, CloudCompare and Blender write what they display.
+    bytes if the largest is between 2 and 255 and all are whole numbers or most are above 2. Others above 1 are white.
+    The result is decoded from sRGB: the formats do not state what colors mean, and MeshLab, CloudCompare and Blender
+    write what they display.
 
     Args:
         value: Colors of any numeric type [n 3].
@@ -457,7 +481,7 @@ def linear_color(value: np.ndarray) -> np.ndarray:
         scaled = value.view(np.uint8).astype(np.float64)
     if value.dtype == np.uint16:
         scaled /= np.iinfo(np.uint16).max
-    elif value.dtype.kind in "iu" or (scaled[np.isfinite(scaled)] > _PAINTED_MOST).any():
+    elif value.dtype.kind in "iu" or _are_bytes(scaled):
         scaled /= _DISPLAY_MOST
     scaled = np.where(np.isfinite(scaled).all(1, keepdims=True), np.clip(scaled, 0, 1), np.nan)
     return pixels.srgb_to_linear(scaled)

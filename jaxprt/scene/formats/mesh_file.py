@@ -6,7 +6,7 @@ import re
 import numpy as np
 
 from jaxprt.files import inputs
-from jaxprt.scene.formats import geometry, gltf_file, gltf_geometry, obj, ply, text
+from jaxprt.scene.formats import file_parts, geometry, gltf_file, gltf_geometry, obj, ply, text
 from jaxprt.scene.formats.geometry import Geometry, MeshContent, Polygons
 
 # Texture coordinates, colors, normals, a fourth coordinate, and another dimension.
@@ -60,9 +60,12 @@ def _off_content(content: bytes, path: pathlib.Path) -> MeshContent:
     corner, count, rest, rest_count = map(np.concatenate, zip(*parts, strict=True))
     shape = Polygons(text.whole_lists(corner, count, "face"), count)
     geometry.check_polygons(shape, vertices, str(path))
-    if of_vertex.get("color") is None and (rest_count == 1).any():
-        ignored.add("indices of colors of faces")
-    of_face = {} if "color" in of_vertex else {"color": _color(rest, rest_count, 3)}
+    if "color" in of_vertex:
+        of_face = {}
+        ignored |= {"colors of faces, beside those of vertices"} if rest_count.any() else set()
+    else:
+        of_face = {"color": _color(rest, rest_count, 3, ignored)}
+        ignored |= {"indices of colors of faces"} if (rest_count == 1).any() else set()
     return MeshContent(geometry.from_polygons(position, shape, of_vertex, {}, of_face, str(path)), [None], ignored)
 
 
@@ -77,26 +80,34 @@ def _vertices(
     if fourth:
         with np.errstate(divide="ignore", invalid="ignore"):  # positions that are not finite are refused later
             position = position / value[:, 3:4]
+    ignored: set[str] = set()
     of_vertex: dict[str, np.ndarray | None] = {"normal": value[:, width:] if normals else None}
     rests = [table.remaining() for table in tables]
     rest, count = map(np.concatenate, zip(*rests, strict=True)) if rests else (np.zeros(0), np.zeros(0, int))
     if textured and len(count) and (count >= 2).all():
         end = np.cumsum(count)
         of_vertex["texture"] = np.stack([rest[end - 2], rest[end - 1]], -1)
-    color = _color(rest, count, 5 if textured else 3) if colored else None
+    color = _color(rest, count, 5 if textured else 3, ignored) if colored else None
     if color is not None:
         of_vertex["color"] = color
-    extra = not textured and not colored and count.any()
-    return position, of_vertex, {"numbers after the coordinates of vertices"} if extra else set()
+    if not textured and not colored and count.any():
+        ignored.add("numbers after the coordinates of vertices")
+    if colored and (count == (3 if textured else 1)).any():
+        ignored.add("indices of colors of vertices")
+    return position, of_vertex, ignored
 
 
-def _color(rest: np.ndarray, count: np.ndarray, least: int) -> np.ndarray | None:
+def _color(rest: np.ndarray, count: np.ndarray, least: int, ignored: set[str]) -> np.ndarray | None:
     """Linear colors from the first three numbers of rows with `least` or more; NaN for others, None if all are."""
     complete = count >= least
+    first = np.cumsum(count) - count
+    if geometry.translucent(rest[(first + 3)[count > least]]):
+        ignored.add("alpha of colors")
     if not complete.any():
         return None
     value = np.full((len(count), 3), np.nan)
-    value[complete] = rest[(np.cumsum(count) - count)[complete, None] + np.arange(3)]
+    value[complete] = rest[first[complete, None] + np.arange(3)]
+    ignored |= geometry.beyond_range(value)
     return geometry.linear_color(value)
 
 
@@ -161,7 +172,10 @@ def read(path: pathlib.Path, *, groups: bool) -> Geometry:
     if path.suffix.lower() in (".glb", ".gltf"):
         with gltf_file.name_file_in_errors(path):
             return gltf_geometry.read(gltf_file.Document(path), groups=groups).geometry
-    return content(path, groups=groups).geometry._replace(color=None)
+    mesh = content(path, groups=groups)
+    if path.suffix.lower() == ".obj":  # of other formats, colors and images alone are ignored
+        file_parts.warn_of_ignored(path, mesh.ignored, stacklevel=3)
+    return mesh.geometry._replace(color=None)
 
 
 _READERS = {".ply": ply.read, ".stl": read_stl, ".off": read_off}

@@ -98,6 +98,8 @@ def rgb(value: Any, name: str) -> np.ndarray:
             raise ValueError(
                 f"{name} must be a number, a color, or a texture of the type bitmap, got {require.shown(value)}"
             )
+        if value.keys() - {"type", "id", "value"} - ({"color"} if "value" not in value else set()):
+            raise ValueError(f"{name} must have a type and a value alone, got {', '.join(map(str, value))}")
         value = inner
     color = _array(value)
     if color is None or color.shape not in ((), (3,)):
@@ -260,7 +262,12 @@ class MaterialMaker:
             wrapped = {"alpha_mode": "blend"} | self._opacity(item, name)
         else:
             self._ignored.add(f"{kind} in {name}")
-        return self._field(inner[0], name, depth + 1) | wrapped
+        field = self._field(inner[0], name, depth + 1)
+        if kind == "mask" and "alpha_mode" in field:  # a mask in a mask: opacities multiply
+            if "alpha_texture" in field and "alpha_texture" in wrapped:
+                raise ValueError(f"{name} must have one opacity with a bitmap, got one in another")
+            wrapped["alpha"] = wrapped.get("alpha", 1.0) * field.get("alpha", 1.0)
+        return field | wrapped
 
     def _opacity(self, item: Mapping[str, Any], name: str) -> dict[str, Any]:
         """The share of light that a `mask` stops. Colors count by their mean, bitmaps by their luminance."""
@@ -280,6 +287,8 @@ class MaterialMaker:
         field |= self._scalar(item, "metallic", 0.0, name) | self._scalar(item, "roughness", 0.5, name)
         field["ior"] = _number(item, "eta", 1.5, name, 1.0)
         if "specular" in item:
+            if "eta" in item:
+                raise ValueError(f"{name} must have specular or eta, got both")
             field["ior"] = 2 / (1 - math.sqrt(0.08 * _number(item, "specular", 0.5, name, 0.0, high=1.0))) - 1
         stretch = _number(item, "anisotropic", 0.0, name, 0.0, high=1.0)
         if stretch and "roughness_texture" in field:
@@ -318,7 +327,8 @@ class MaterialMaker:
         alpha = 0.0
         if item["type"] == "roughplastic":
             alpha = _number(item, "alpha", 0.1, name, 0.0, high=1.0)
-            _word(item, "distribution", name, _DISTRIBUTIONS)
+            if _word(item, "distribution", name, _DISTRIBUTIONS) != "ggx":
+                self._ignored.add(f"distribution beckmann of {name}")
         field = self._color(item, "diffuse_reflectance", 0.5, name)
         return field | {"metallic": 0.0, "roughness": math.sqrt(alpha), "ior": ratio}
 
@@ -391,7 +401,9 @@ def read(scene: Mapping[str, Any]) -> Scene:
         elif kind in _EMITTERS:
             materials.rest(item, name)
             lights.append(_environment(name, item))
-        elif not MaterialMaker.knows(kind) and kind not in _SILENT:
+        elif kind in _SILENT:
+            ignored |= {f"hide_emitters of {name}"} if item.get("hide_emitters") else set()
+        elif not MaterialMaker.knows(kind):
             ignored.add(f"{name} ({kind})")
     warn_of_ignored("the dictionary", ignored, stacklevel=3)
     return Scene(parts, cameras, lights)
@@ -507,6 +519,8 @@ def _camera(name: str, item: Mapping[str, Any], materials: MaterialMaker, ignore
     film: Mapping[str, Any] = {}
     for key, plugin in materials.plugins(item, name).items():
         if "film" in plugin["type"]:
+            if film:
+                raise ValueError(f"{name} must have one film, got two")
             film = plugin
             materials.plugins(film, f"{key} of {name}", "film")
         elif plugin["type"] not in _SILENT:
@@ -535,6 +549,8 @@ def _environment(name: str, item: Mapping[str, Any]) -> Environment:
     turned = transform(item.get("to_world"), f"to_world of {name}")
     if item["type"] == "constant":
         color = rgb(item.get("radiance", 1.0), f"radiance of {name}")
+        if color.min() < 0:
+            raise ValueError(f"radiance of {name} must be at least 0, got {color.tolist()}")
         return Environment(jnp.asarray(np.broadcast_to(color, (6, 1, 1, 3)), jnp.float32))
     scale = _number(item, "scale", 1.0, name, 0.0)
     turned = _rotation(turned, f"to_world of {name}")

@@ -20,6 +20,7 @@ from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.mesh import CLEAR
 
 KIND = "an undamaged OBJ file"
+_WHITE = re.compile(r"[ \t]+")
 _COMMENT = re.compile(r"^#.*|\s#(\s.*)?$")  # names may contain a #, such as Blender's "Material_#25"
 _NAMING = re.compile(rb"^[^\S\n]*(usemtl|mtllib)(?!\S)([^\n]*)", re.MULTILINE)
 _FACE = re.compile(rb"^[^\S\n]*f\s", re.MULTILINE)
@@ -29,8 +30,8 @@ _CONTINUED = b" \v"  # replaces the line end after a backslash; \v is white spac
 _BLOCK = 1 << 16  # lines whose words are in memory at once
 _LEAST = {b"v": 3, b"vt": 1, b"vn": 3}  # fewest numbers of a statement
 _MOST = 8  # numbers of a statement that are looked at
-# Statements without effect on triangles, besides those that are read. Smoothing groups only matter without normals.
-_HARMLESS = {b"o", b"g", b"usemtl", b"mtllib", b"s", b"lod", b"bevel", b"c_interp", b"d_interp", b""}
+# Statements without effect on triangles, besides those that are read. Smoothing groups (s) matter without normals.
+_HARMLESS = {b"o", b"g", b"usemtl", b"mtllib", b"lod", b"bevel", b"c_interp", b"d_interp", b""}
 _LISTED = 8  # unknown statements that a warning names
 _NONE = -1 << 62  # index that a corner does not have
 _WRONG = -1 << 61  # index that is no number or refers to nothing
@@ -61,6 +62,7 @@ _UNIT, _NORMALS = 0.1, 0.9  # deviation of normals from unit length, and the lea
 _BLUISH = 0.1  # by which the mean height of normals exceeds their slopes
 _SAMPLED = 1 << 18  # pixels of which normal maps are recognized
 _OPACITY = {"d", "Tr"}
+_CONTRADICTS = 0.01  # deviation of d + Tr from 1
 _BLENDER = re.compile(
     r"# Blender (v?)(\d+)\.(\d+)"
 )  # first line of OBJ files by Blender; the v is from its older exporter
@@ -156,6 +158,7 @@ def _statements(source: _Source, *, groups: bool) -> tuple[list[_Rows], _Faces, 
     unread: dict[bytes, None] = {}
     names = {b"o": "", b"g": ""} if groups else {b"usemtl": ""}
     region, start = -1, 0
+    group, smoothed = b"", set[bytes]()
     stream = io.BytesIO(source.content)
     # In blocks of lines, so that not all words are in memory at once.
     while lines := list(itertools.islice(stream, _BLOCK)):
@@ -172,8 +175,11 @@ def _statements(source: _Source, *, groups: bool) -> tuple[list[_Rows], _Faces, 
                 if kind == b"f":
                     region = regions.setdefault(tuple(names.values()), len(regions)) if region < 0 else region
                     region_of.append(region)
+                    smoothed.add(group)
             elif kind in names:
                 names[kind], region = _name(tail), -1
+            elif kind == b"s":
+                group = tail.partition(b"#")[0].strip()
             elif kind not in _HARMLESS and not kind.startswith(b"#"):
                 unread[kind] = None
         for kind, parts in rows.items():
@@ -186,6 +192,8 @@ def _statements(source: _Source, *, groups: bool) -> tuple[list[_Rows], _Faces, 
     ignored |= {f"{len(unread) - _LISTED} statements more"} if len(unread) > _LISTED else set()
     empty = _Faces(np.zeros((0, 3), np.int64), *np.zeros((3, 0), np.int64))
     joined = _Faces(*map(np.concatenate, zip(empty, *faces, strict=True)))
+    if (smoothed & {b"off", b"0"} or len(smoothed) > 1) and (joined.corner[:, 2] == _NONE).any():
+        ignored.add("smoothing groups (s) of faces without normals")
     return [_rows(parts) for parts in rows.values()], joined, ignored
 
 
@@ -329,6 +337,8 @@ def _extra_numbers(vertex: np.ndarray) -> set[str]:
     ignored: set[str] = set()
     if (vertex[count == 4, 3:4] != 1).any():
         ignored.add("the fourth number of vertices, a weight (polygons have none)")
+    if vertex.shape[1] >= 6:
+        ignored |= geometry.beyond_range(vertex[:, 3:6])
     if (count == 5).any() or not np.isin(vertex[count > 6, 6:], (1, 255)).all():
         ignored.add("numbers of vertices beyond x y z w and x y z r g b")
     return ignored
@@ -432,14 +442,14 @@ def read_mtl(
     if not lines or not lines[0].startswith("# Blender"):
         blender = None
     for line in lines:
-        key, *rest = statement(line).split() or [""]
+        key, rest = [*_WHITE.split(statement(line), maxsplit=1), ""][:2]
         if key == "newmtl":
-            name = " ".join(rest)
+            name = statement(rest.replace("\t", " "))
             previous = named.get(name)
             named[name] = statements = {}
             several |= {name: previous} if previous else {}
         elif key:
-            words = rest if key in _MAPS or key in _BUMPS else " ".join(rest).partition("#")[0].split()
+            words = [rest] if key in _MAPS or key in _BUMPS else rest.partition("#")[0].split()
             if statements.get(key, words) != words and name in wanted:
                 ignored.add(f"all but the last {key} of material {name!r}")
             statements[key] = words
@@ -477,9 +487,12 @@ def _material(
         if key in _BUMPS and "norm" in statements:
             ignored.add(f"{key} beside norm")
         elif key in _MAPS or key in _BUMPS:
-            options, words = _options(words)
+            options, image = _options(words[0])
+            if not image:
+                ignored.add(f"{key} without a file")
+                continue
             owner = f"{path}, {key} of material {inputs.shortened(name)!r}"
-            file = refer(" ".join(words), path.parent, owner=owner)
+            file = refer(image, path.parent, owner=owner)
             _add_map(field, key, options, file, owner, ignored, pictures)
         elif key not in value and key not in _SILENT | _OPACITY | {"Tf"}:
             ignored.add(key)
@@ -501,6 +514,7 @@ def _material(
         field["roughness"] = value.get("Pr", 1.0 if "roughness_texture" in field else roughness)
         field["metallic"] = value.get("Pm", 1.0 if "metallic_texture" in field else 0.0)
         field["ior"] = max(1.0, value.get("Ni", 1.5))
+        ignored |= {"Ks beside Pr and Pm"} if np.ptp(value.get("Ks", 0.0)) else set()
     elif "Ks" not in value or value.get("illum", 2) < 2:
         field |= {"metallic": 0.0, "roughness": roughness, "specular": 0.0}
     else:  # with the default index of refraction the reflectance is 4 % times the color
@@ -518,6 +532,8 @@ def _opacity(
         number = _number(statements, key, path, name)
         if not 0 <= number <= 1:
             ignored.add(f"{key} below 0 or above 1")
+        if key == "d" and "Tr" in statements and abs(number + _number(statements, "Tr", path, name) - 1) > _CONTRADICTS:
+            ignored.add("Tr beside d")
         alpha = min(max(number if key == "d" else 1 - number, 0.0), 1.0)
         if statements[key][0] == "-halo" and alpha < 1:
             ignored.add(f"-halo of {key}")
@@ -665,19 +681,20 @@ def _is_neutral(option: str, words: list[str]) -> bool:
     return option in _NEUTRAL and value == neutral[: len(value)]
 
 
-def _options(words: list[str]) -> tuple[dict[str, list[str]], list[str]]:
-    """The options of a map, and the words of its file name, which follow them."""
+def _options(statement: str) -> tuple[dict[str, list[str]], str]:
+    """The options of a map, and its file name, which follows them."""
+    words = [(match[0], match.start()) for match in re.finditer(r"\S+", statement)]
     options: dict[str, list[str]] = {}
     place = 0
-    while place < len(words) - 1 and words[place].startswith("-"):
-        key, end = words[place], place + 1
+    while place < len(words) - 1 and words[place][0].startswith("-"):
+        key, end = words[place][0], place + 1
         while end < len(words) - 1 and end - place <= _ARGUMENTS.get(key, 1):
-            if key in _ARGUMENTS and not _is_number(words[end]):
+            if key in _ARGUMENTS and not _is_number(words[end][0]):
                 break
             end += 1
-        options[key] = words[place + 1 : end]
+        options[key] = [word for word, _ in words[place + 1 : end]]
         place = end
-    return options, words[place:]
+    return options, statement[words[place][1] :] if words else ""
 
 
 def _is_number(word: str) -> bool:

@@ -44,6 +44,12 @@ _WEDGES = "texcoord"
 _TEXTURE = (("u", "v"), ("s", "t"), ("texture_u", "texture_v"), ("texture_s", "texture_t"))
 _COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 _ALPHA = ("alpha", "diffuse_alpha", "a")
+# What is read of vertices and faces, and what tells nothing of the picture: scanners and their programs write it.
+_READ = {*"xyz", "nx", "ny", "nz", "texnumber", *_CORNERS, _WEDGES}
+_READ |= {name for names in (*_TEXTURE, *_COLORS, _ALPHA) for name in names}
+_LISTED = 8  # names in a warning
+_HARMLESS = {"quality", "confidence", "intensity", "flags", "radius", "label", "id", "index", "object_id", "timestamp"}
+_HARMLESS |= {"curvature", "camera", "edge", "range_grid", "user"}
 _IMAGE = re.compile(r"texture\s*file\s+(.+)", re.IGNORECASE)
 
 
@@ -82,12 +88,14 @@ class PlyHeader(NamedTuple):
         order: Byte order, "<" or ">"; "" for text.
         elements: The elements, in the order of their tables.
         comments: Comments without their keyword.
+        unknown: Keywords that the format does not have.
         end: Position of the first byte after the header.
     """
 
     order: str
     elements: list[Element]
     comments: list[str]
+    unknown: set[str]
     end: int
 
 
@@ -103,7 +111,7 @@ def read_header(content: bytes) -> PlyHeader:
     end = re.compile(rb"[\r\n]end_header[ \t]*(?:" + line_end + rb"|\Z)").search(content)
     if not end:
         raise ValueError("its header must end with a line 'end_header'")
-    order, comments = None, []
+    order, comments, unknown = None, [], set()
     elements: list[Element] = []
     for line in re.split(rb"[\r\n]+", content[start.end() : end.start()]):
         keyword, rest = [*text.name(line).split(None, 1), "", ""][:2]
@@ -117,11 +125,13 @@ def read_header(content: bytes) -> PlyHeader:
                 elements[-1].properties.append(_property(words, order or ""))
             elif keyword == "comment":
                 comments.append(rest.strip())
+            elif keyword and keyword != "obj_info":
+                unknown.add(f"header lines {keyword}")
         except (KeyError, IndexError, ValueError):
             raise ValueError(f"its header has a line that is not known, {text.name(line)[:80]!r}") from None
     if order is None:
         raise ValueError(f"its header must state a format, one of {', '.join(_ORDERS)}")
-    header = PlyHeader(order, elements, comments, end.end())
+    header = PlyHeader(order, elements, comments, unknown, end.end())
     _check_counts(header, len(content) - header.end)
     return header
 
@@ -370,11 +380,24 @@ def read(path: pathlib.Path) -> MeshContent:
             raise ValueError(f"{path} must hold vertices and faces, got no faces")
         geometry.check_polygons(faces, len(position), str(path))
         images = [match[1].strip() for comment in header.comments if (match := _IMAGE.match(comment))]
-        return _ply_content(position, vertex, face, faces, corners, images, str(path))
+        mesh = _ply_content(position, vertex, face, faces, corners, images, str(path))
+        return mesh._replace(ignored=mesh.ignored | _unread(header))
     except ValueError as error:
         if str(error).startswith(str(path)):
             raise
         raise text.unreadable(path, "PLY", error) from error
+
+
+def _unread(header: PlyHeader) -> set[str]:
+    """Names of elements and properties that are not read and may matter to the picture."""
+    unread = set(header.unknown)
+    for element in header.elements:
+        if element.name in ("vertex", "face"):
+            names = {item.name for item in element.properties} - _READ - _HARMLESS
+            unread |= {f"{name} of {element.name}" for name in names if not name.startswith("scalar_")}
+        elif element.name not in {*_STRIPS, *_HARMLESS}:
+            unread.add(f"elements {element.name}")
+    return {*sorted(unread)[:_LISTED], f"{len(unread) - _LISTED} more"} if len(unread) > _LISTED else unread
 
 
 def _faces(face: Columns, table: dict[str, Columns]) -> tuple[Polygons, int]:
@@ -433,6 +456,7 @@ def _ply_content(
         of_face["region"] = np.zeros(len(number), int)
         of_face["region"][drawn] = region
         regions = [images[int(label)] if 0 <= label < len(images) else None for label in labels]
+        ignored |= {f"texnumber {label:g} (there is no such TextureFile)" for label in labels if label >= len(images)}
     elif images:
         regions = [images[0]]
         ignored |= {f"TextureFile {image} (no face has its texnumber)" for image in images[1:]}
@@ -452,8 +476,10 @@ def _color(table: Columns) -> tuple[np.ndarray | None, set[str]]:
     if value is None or not len(value):
         return None, set()
     alpha = next((column for name in _ALPHA if isinstance(column := table.get(name), np.ndarray)), None)
-    translucent = alpha is not None and len(np.unique(alpha)) > 1
-    return geometry.linear_color(value), {"alpha of colors"} if translucent else set()
+    ignored = geometry.beyond_range(value)
+    if alpha is not None and geometry.translucent(alpha):
+        ignored |= {"alpha of colors"}
+    return geometry.linear_color(value), ignored
 
 
 def _wedges(face: Columns, faces: Polygons, corners: int) -> np.ndarray | None:

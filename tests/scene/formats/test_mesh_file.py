@@ -90,6 +90,12 @@ def test_what_cannot_be_read_of_an_off_file_is_named_in_a_warning(tmp_path):
         load_scene(off(tmp_path, faces=["4 0 1 2 3 7"]))
     with pytest.warns(UserWarning, match=r"mesh\.off: .* numbers after the coordinates of vertices"):
         load_scene(off(tmp_path, rows=[f"{row} 1 2 3" for row in ROWS]))
+    with pytest.warns(UserWarning, match=r"are colors of faces, beside those of vertices$"):
+        load_scene(off(tmp_path, "COFF", [f"{row} 1 0 0" for row in ROWS], ["4 0 1 2 3 0 1 0"]))
+    with pytest.warns(UserWarning, match=r"are indices of colors of vertices$"):
+        load_scene(off(tmp_path, "COFF", [f"{row} 7" for row in ROWS]))
+    with pytest.warns(UserWarning, match=r"are alpha of colors$"):
+        load_scene(off(tmp_path, "COFF", [f"{row} 1 0 0 .5" for row in ROWS]))
 
 
 def test_normals_texture_coordinates_and_fourth_coordinates_of_off_files_are_read(tmp_path):

@@ -147,7 +147,9 @@ def test_bsdfs_become_metallic_roughness_materials():
     assert alpha == pytest.approx(0.25 * aspect)
     assert alpha + (1 - alpha) * float(disney.anisotropy) ** 2 == pytest.approx(0.25 / aspect)
     assert float(disney.ior) == pytest.approx(1.5)
-    plastic = one({"type": "roughplastic", "diffuse_reflectance": 0.3, "alpha": 0.04, "int_ior": 1.6})
+    plastic = one(
+        {"type": "roughplastic", "diffuse_reflectance": 0.3, "alpha": 0.04, "int_ior": 1.6, "distribution": "ggx"}
+    )
     assert (float(plastic.roughness), float(plastic.ior)) == (pytest.approx(0.2), pytest.approx(1.6 / 1.000277))
     np.testing.assert_allclose(
         load_scene({"type": "scene", "a": {"type": "rectangle"}}).parts[0].material.base_color, 0.5
@@ -166,18 +168,26 @@ def test_masks_are_opacities_and_two_sided_backs_are_lit(tmp_path):
     assert (plain.alpha_mode, float(plain.alpha), plain.back) == ("blend", 0.25, "lit")
     texture = one({"type": "bitmap", "filename": str(tmp_path / "hole.png"), "raw": True}).alpha_texture
     np.testing.assert_allclose(texture.image[0, :, 0], [0, 1], atol=1e-6)
+    inner = {"type": "mask", "opacity": 0.5, "a": {"type": "diffuse"}}
+    assert float(one(0.2, inner={"type": "twosided", "a": inner}).alpha) == pytest.approx(0.1)
+    masked = {"type": "mask", "opacity": {"type": "bitmap", "filename": str(tmp_path / "hole.png")}}
+    both = one(0.5, inner=masked | {"a": {"type": "diffuse"}})
+    assert (float(both.alpha), both.alpha_texture is None) == (0.5, False)
+    with pytest.raises(ValueError, match="bsdf of a must have one opacity with a bitmap, got one in another"):
+        one(masked["opacity"], inner=masked | {"a": {"type": "diffuse"}})
 
 
 def test_what_has_no_equal_is_said_by_name():
     inner = {"type": "principled", "clearcoat": 0.5, "sheen": 0.0, "anisotropic": 0.2}
     scene = {
-        **{"type": "scene", "lamp": {"type": "point"}, "pane": {"type": "disk"}, "integrator": {"type": "path"}},
+        **{"type": "scene", "lamp": {"type": "point"}, "pane": {"type": "disk"}},
+        "integrator": {"type": "path", "hide_emitters": True},
         "sheet": {"type": "rectangle", "to_world": np.eye(4).tolist(), "bsdf": {"type": "twosided", "inner": inner}},
     }
     with pytest.warns(UserWarning, match="not supported and ignored") as caught:
         load_scene(scene)
     (message,) = [str(each.message) for each in caught]
-    expected = r"clearcoat of bsdf of sheet, lamp (point), pane (disk)"
+    expected = r"clearcoat of bsdf of sheet, hide_emitters of integrator, lamp (point), pane (disk)"
     assert message == f"the dictionary: not supported and ignored are {expected}"
 
 
@@ -299,6 +309,10 @@ def sensor(**field):
         *[(sensor(film=FILM | {"width": x}), "width of the film of eye must be .*, got") for x in (0, 8.5, "8", True)],
         *[(sensor(to_world=np.diag([x, 1, 1, 1])), "to_world of eye must be a pure rotation") for x in (0, -1, 2)],
         *[({"sky": {"type": "constant", "radiance": x}}, "radiance of sky must be") for x in ("x", [1, 2], {}, np.nan)],
+        ({"sky": {"type": "constant", "radiance": -1}}, "radiance of sky must be at least 0, got"),
+        (matte(type="principled", specular=0.5, eta=1.9), "bsdf of sheet must have specular or eta, got both"),
+        (matte(reflectance={"type": "rgb", "value": 0.5, "scale": 2}), "must have a type and a value alone, got type"),
+        (sensor(film=FILM, other=FILM), "eye must have one film, got two"),
         ({"sky": {"type": "envmap", "filename": "x.exr", "scale": "2"}}, "scale of sky must be real numbers, got"),
         ({"sky": {"type": "envmap", "filename": None}}, "filename of sky must be a path"),
     ],

@@ -342,12 +342,28 @@ def test_damaged_images_are_decoded_once_and_named_once(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("statement", "alpha"),
-    [("d 0.5", 0.5), ("d -halo 1.0", None), ("d 1 # -halo", None), ("Tr .25", 0.75), ("d .5\nTr .25", 0.5)],
+    [("d 0.5", 0.5), ("d -halo 1.0", None), ("d 1 # -halo", None), ("Tr .25", 0.75), ("d .5\nTr .5", 0.5)],
 )
 def test_d_and_tr_are_opacities(tmp_path, statement, alpha):
     material = one(tmp_path, f"{statement}\n").material
     got = None if material.alpha_mode == "opaque" else float(material.alpha)
     assert (got, material.alpha_mode) == (alpha, "opaque" if alpha is None else "blend")
+
+
+@pytest.mark.parametrize("name", ["two  spaces", "wide\u3000space", "hard\xa0space"])
+def test_names_of_materials_and_images_are_read_as_they_stand(tmp_path, name):
+    write_png(tmp_path / f"{name}.png", np.full((1, 1, 3), 0.5))
+    write_png(tmp_path / f"{' '.join(name.split())}.png", np.ones((1, 1, 3)))
+    write_png(tmp_path / f"{name}.png", np.full((1, 1, 3), 0.5))
+    path = write_materials(tmp_path, f"newmtl {name}\nmap_Kd -s 1 1 1 {name}.png\n", f"usemtl {name}\n{FACE}")
+    (part,) = load_scene(path).parts
+    assert part.name == name
+    assert float(np.max(part.material.base_color_texture.image)) < 0.9
+
+
+def test_a_map_without_a_file_is_named(tmp_path):
+    with pytest.warns(UserWarning, match="ignored are Ks beside Pr and Pm, map_Kd without a file$"):
+        one(tmp_path, "Pr .3\nKs .9 .1 .1\nmap_Kd\n")
 
 
 def test_map_d_is_the_alpha_of_an_image_or_else_its_gray(tmp_path):
@@ -357,6 +373,8 @@ def test_map_d_is_the_alpha_of_an_image_or_else_its_gray(tmp_path):
         material = one(tmp_path, f"d .5\nmap_d {name}.png\n").material
         assert (float(material.alpha), material.alpha_mode) == (0.5, "blend")
         np.testing.assert_allclose(material.alpha_texture.image, [[[0.2]]], rtol=1e-6)
+    with pytest.warns(UserWarning, match="ignored are Tr beside d$"):
+        assert float(one(tmp_path, "d .5\nTr .2\n").material.alpha) == 0.5
     with pytest.warns(UserWarning, match="ignored are d below 0 or above 1"):
         assert float(one(tmp_path, "d -1\n").material.alpha) == 0
 
@@ -453,6 +471,8 @@ def test_materials_of_several_files_are_those_of_the_first(tmp_path):
         ),
         ("v 0 0 0 1 0 0 .5\nv 0 0 1 1 0 0\nv 1 0 0\nf 1 2 3", "numbers of vertices beyond x y z w and x y z r g b"),
         (TRIANGLE + "l 1 2\np 1\nusemap x\ns off\nlod 1\n", "statements l, statements p, statements usemap"),
+        ("s off\n" + TRIANGLE + "s 1\n", r"smoothing groups \(s\) of faces without normals"),
+        ("v 0 0 0 3.5 .5 .5\nv 0 0 1 .5 .5 .5\nv 1 0 0 .2 .5 .5\nf 1 2 3", "colors below 0 or above 1"),
         (TRIANGLE + "".join(f"x{number}\n" for number in range(11)), "3 statements more, statements x0, .*"),
     ],
 )
@@ -540,8 +560,8 @@ def test_real_files_have_the_regions_of_their_meshes_and_say_what_is_missing(dat
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         scene = load_scene(path)
-    assert len(caught) <= 1
-    own = split(load_mesh(path))
+        own = split(load_mesh(path))
+    assert len(caught) <= 2
     assert [len(part.mesh.face) for part in scene.parts] == [len(each.face) for each in own]
     for part in scene.parts:
         assert np.isfinite(part.surface().base_color).all()

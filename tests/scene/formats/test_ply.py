@@ -384,9 +384,25 @@ def test_files_of_points_and_pipes_are_refused(tmp_path):
             load(tmp_path / "pipe.ply")
 
 
-def test_varying_alpha_is_named_in_a_warning_and_constant_alpha_is_not(tmp_path):
+def test_what_a_picture_would_show_and_is_not_read_is_named(tmp_path):
+    more = "".join(f"property float {name}\n" for name in ("quality", "scalar_C2M", "f_dc_0", "emissive_red"))
+    path = write(
+        tmp_path,
+        [
+            ("vertex", XYZ + more, [(*position, 0, 0, 0, 0) for position in SQUARE.tolist()]),
+            ("face", FACES, [([0, 1, 2, 3],)]),
+            ("material", "property uchar ambient_red\n", [(0,)]),
+        ],
+    )
+    path.write_bytes(path.read_bytes().replace(b"end_header", b"colour x\nobj_info y\nend_header", 1))
+    expected = "elements material, emissive_red of vertex, f_dc_0 of vertex, header lines colour"
+    with pytest.warns(UserWarning, match=f"not supported and ignored are {expected}$"):
+        load_scene(path)
+
+
+def test_alpha_is_named_in_a_warning_but_where_it_is_0_or_opaque_everywhere(tmp_path):
     properties = XYZ + "".join(f"property uchar {name}\n" for name in ("red", "green", "blue", "alpha"))
-    for alpha, count in (([0, 0, 0, 0], 0), ([255, 255, 255, 0], 1)):
+    for alpha, count in (([0] * 4, 0), ([255] * 4, 0), ([255, 255, 255, 0], 1), ([100] * 4, 1)):
         rows = [(*position, 255, 0, 0, a) for position, a in zip(SQUARE.tolist(), alpha, strict=True)]
         path = write(tmp_path, [("vertex", properties, rows), ("face", FACES, [([0, 1, 2, 3],)])])
         with warnings.catch_warnings(record=True) as caught:
