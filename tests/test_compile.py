@@ -46,7 +46,6 @@ def twice(function):
         jax.jit,
         jax.grad,
         lambda f: jax.jit(jax.grad(f)),
-        jax.hessian,
         twice,
         lambda f: jax.jacrev(jax.grad(f)),
         lambda f: twice(lambda x, matrix: jnp.sum(jax.grad(f)(x, matrix) ** 2)),
@@ -74,7 +73,7 @@ CHANGES = [
 ]
 
 
-@pytest.mark.parametrize("axes", [(0, None), (None, 0), (0, 0), (2, 1)])
+@pytest.mark.parametrize("axes", [(0, None), (None, 0), (2, 1)])
 @pytest.mark.parametrize(("change", "one"), CHANGES)
 def test_batches_are_loops(axes, change, one, x, matrix):
     random = np.random.default_rng(2)

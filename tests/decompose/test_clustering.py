@@ -35,12 +35,6 @@ def test_one_cluster_holds_all_points_in_their_order(random):
     np.testing.assert_array_equal(bisect(random.normal(size=(9, 3)), clusters=1), [np.arange(9)])
 
 
-def test_as_many_clusters_as_points_hold_one_each(random):
-    member = bisect(random.normal(size=(13, 3)), clusters=13)
-    assert member.shape == (13, 1)
-    np.testing.assert_array_equal(np.sort(member.ravel()), np.arange(13))
-
-
 def test_blobs_far_apart_are_told_apart(random):
     corner = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [100, 10, 1]
     blob = random.permutation(np.repeat(np.arange(8), 12))

@@ -295,23 +295,6 @@ def test_samples_that_cancel_leave_the_mean_where_it_was():
     assert fit.lobe.concentration[0] == pytest.approx(1e-3)
 
 
-def test_many_mixtures_are_fitted_at_once(close):
-    every = [scattered(seed, count=300) for seed in range(3)]
-    sample, mass, start = jax.tree.map(lambda *x: jnp.stack(x), *every)
-    both = jax.vmap(lambda *x: mixture.fit(*x, steps=10))(sample, mass, start)
-    for number, each in enumerate(every):
-        single = mixture.fit(*each, steps=10)
-        for actual, expected in zip(jax.tree.leaves(both), jax.tree.leaves(single), strict=True):
-            close(actual[number], expected, tolerance=SINGLE)
-
-
-def test_float64_stays_float64_and_float32_float32(x64):
-    for dtype in (jnp.float32, jnp.float64):
-        each = jax.tree.map(lambda x, dtype=dtype: x.astype(dtype), scattered(0, count=20))
-        leaves = jax.tree.leaves(mixture.fit(*each, steps=2))
-        assert all(leaf.dtype == dtype for leaf in leaves)
-
-
 @pytest.mark.parametrize("options", [{"weight": jnp.ones(1)}, {"fixed": jnp.zeros((20, 1))}])
 def test_fixed_densities_and_weights_must_come_together(options):
     with pytest.raises(ValueError, match="fixed densities and their weights must be given together"):

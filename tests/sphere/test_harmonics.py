@@ -10,7 +10,6 @@ from scipy.special import eval_legendre, sph_harm_y
 from jaxprt.sphere import cubemap, harmonics
 
 DEGREE = 50
-TEXEL = 3e-3  # A harmonic constant on texels of 1/32 of a face is off by the square of their width: 2e-3 at degree 4.
 POLES = np.array([[0.0, 0, 1], [0, 0, -1]])
 
 
@@ -70,24 +69,6 @@ def test_degree_50_evaluates_in_float32(x64, close):
     close(harmonics.evaluate(direction, degree=DEGREE), scipy_basis(exact, DEGREE))
 
 
-def test_the_first_nine_have_the_signs_and_factors_of_the_table(x64, close):
-    direction = unit(2, 30)
-    x, y, z = np.asarray(direction).T
-    first, second = np.sqrt(3 / (4 * np.pi)), np.sqrt(15 / (4 * np.pi))
-    expected = [
-        np.full_like(x, np.sqrt(1 / (4 * np.pi))),
-        first * y,
-        first * z,
-        first * x,
-        second * x * y,
-        second * y * z,
-        np.sqrt(5 / (16 * np.pi)) * (3 * z**2 - 1),
-        second * x * z,
-        np.sqrt(15 / (16 * np.pi)) * (x**2 - y**2),
-    ]
-    close(harmonics.evaluate(direction, degree=2), np.stack(expected, -1))
-
-
 @pytest.mark.parametrize("pole", POLES)
 def test_the_gradient_at_the_poles_is_that_along_great_circles(pole, x64, close):
     jacobian = jax.jacfwd(lambda s: harmonics.evaluate(s, degree=8))(jnp.asarray(pole))
@@ -117,14 +98,6 @@ def test_gradients_of_high_degree_in_float32_are_those_of_finite_differences(x64
     close(gradient, np.stack(expected, -1))
 
 
-@pytest.mark.parametrize("l", [0, 1, 2, 4])
-def test_a_cubemap_that_holds_one_harmonic_projects_to_it(l, close):
-    basis = np.asarray(harmonics.evaluate(cubemap.direction(size=32), degree=4))
-    rows = np.arange(l * l, (l + 1) ** 2)
-    coefficient = harmonics.project(jnp.asarray(basis[..., rows]), degree=4)
-    close(coefficient, np.eye(25, dtype=np.float32)[:, rows], tolerance=TEXEL)
-
-
 def test_the_error_of_projected_harmonics_falls_with_the_square_of_the_texels(x64):
     error = []
     for size in (8, 16, 32):
@@ -135,7 +108,7 @@ def test_the_error_of_projected_harmonics_falls_with_the_square_of_the_texels(x6
     assert (ratio < 4.5).all()
 
 
-@pytest.mark.parametrize(("size", "degree"), [(1, 12), (2, 3), (5, 12), (16, 0), (16, 4)])
+@pytest.mark.parametrize(("size", "degree"), [(1, 12), (5, 12), (16, 0)])
 def test_constant_light_has_one_coefficient_only(size, degree, x64, close):
     expected = np.zeros(((degree + 1) ** 2, 2))
     expected[0] = np.sqrt(4 * np.pi) * np.array([1, 3])
@@ -168,25 +141,12 @@ def test_the_mean_of_any_cubemap_is_weighted_by_its_solid_angles(x64, close):
     close(harmonics.project(radiance, degree=2)[0], expected)
 
 
-def test_projection_is_the_same_in_float32(x64, close):
-    radiance = jnp.abs(normal(7, 6, 32, 32, 3))
-    expected = harmonics.project(radiance, degree=14)
-    close(harmonics.project(radiance.astype(jnp.float32), degree=14), expected)
-
-
 def test_reconstruction_sums_coefficients_times_the_basis(x64, close):
     direction = unit(8, 12).reshape(3, 4, 3)
     basis = scipy_basis(direction.reshape(-1, 3), 6).reshape(3, 4, 49)
     for channel in ((), (3,), (2, 3)):
         coefficient = normal(9, 49, *channel)
         close(harmonics.reconstruct(coefficient, direction), np.tensordot(basis, coefficient, 1))
-
-
-def test_a_reconstructed_function_has_the_coefficients_it_came_from(x64, close):
-    coefficient = normal(10, 81, 3)
-    direction, weight = quadrature(8)
-    value = np.asarray(harmonics.reconstruct(coefficient, jnp.asarray(direction)))
-    close((scipy_basis(direction, 8) * weight[:, None]).T @ value, coefficient)
 
 
 def test_the_clamped_cosine_has_the_factors_of_its_integral(x64, close):
@@ -202,10 +162,6 @@ def test_phong_lobes_have_the_factors_of_their_integral(exponent, x64, close):
     expected = [zonal_factor(lambda t: scale * t**exponent, l, 0, 1) for l in range(15)]
     close(harmonics.phong(jnp.array(exponent), degree=14), np.array(expected))
     close(harmonics.phong(jnp.array(exponent), degree=0), np.ones(1))
-
-
-def test_the_phong_lobe_of_exponent_one_is_the_cosine_over_pi(x64, close):
-    close(np.pi * harmonics.phong(jnp.array(1.0), degree=20), harmonics.cosine(degree=20))
 
 
 def test_a_convolved_light_is_the_integral_of_the_light_over_the_kernel(x64, close):
@@ -257,13 +213,6 @@ def test_the_change_of_a_disc_with_its_angle_is_its_rim(angle, x64, close):
     else:
         close(actual, expected)
     close(jax.jacrev(lambda a: harmonics.disc(direction, a, degree=14))(jnp.array(angle)), actual)
-
-
-def test_the_change_of_a_disc_with_its_direction_is_that_of_the_basis(x64, close):
-    for direction in (*unit(14, 2), *jnp.asarray(POLES)):
-        jacobian = jax.jacrev(lambda s: harmonics.disc(s, jnp.array(0.3), degree=6))(direction)
-        basis = jax.jacfwd(lambda s: harmonics.evaluate(s, degree=6))(direction)
-        close(jacobian, disc_factors(0.3, 6)[band(6)][:, None] * basis)
 
 
 def test_hann_and_lanczos_are_their_values_of_the_band_over_the_first_left_out(x64, close):

@@ -40,11 +40,6 @@ def test_integrals_are_those_of_the_table(close):
     close(hats.integrals(jnp.asarray(value), cells=CELLS), expected)
 
 
-def test_the_integrals_of_one_sum_to_the_sphere(close):
-    ones = jnp.ones((6, SIZE, SIZE))
-    close(jnp.sum(hats.integrals(ones, cells=CELLS)), 4 * np.pi)
-
-
 def test_projection_is_the_solution_of_least_squares(close):
     value = np.random.default_rng(1).normal(size=(6, SIZE, SIZE, 2)).astype(np.float32)
     root = np.sqrt(np.asarray(cubemap.solid_angle(size=SIZE), np.float64).reshape(-1, 1))

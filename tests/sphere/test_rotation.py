@@ -74,13 +74,6 @@ def test_rotating_the_basis_is_evaluating_it_in_rotated_directions(degree, x64, 
         close(basis @ rotation.matrix(turn, degree=degree).T, expected)
 
 
-def test_a_rotated_function_has_the_value_that_was_in_the_direction_rotated_back(x64, close):
-    coefficient, direction = normal(1, 64, 2), unit(2, 40)
-    for turn in rotations(3, 3):
-        actual = harmonics.reconstruct(rotation.rotate(coefficient, turn), direction)
-        close(actual, harmonics.reconstruct(coefficient, direction @ turn))
-
-
 def test_in_float32_every_special_rotation_keeps_the_theorem(close):
     direction = unit(0, 40, np.float32)
     for turn in jnp.asarray(EVERY, jnp.float32):
@@ -99,33 +92,6 @@ def test_degree_50_rotates_in_float32(x64, close):
         close(actual, expected)
 
 
-def test_products_of_rotations_become_products_of_matrices(x64, close):
-    degree = 7
-
-    def matrix(turn):
-        return rotation.matrix(turn, degree=degree)
-
-    pairs = np.stack(np.meshgrid(np.arange(len(EVERY)), np.arange(len(EVERY)))).reshape(2, -1)
-    first, second = jnp.asarray(EVERY)[pairs]
-    all_of_them = jax.vmap(matrix)
-    close(all_of_them(first @ second), all_of_them(first) @ all_of_them(second))
-
-
-def test_the_matrix_is_orthogonal_and_its_transpose_that_of_the_inverse(x64, close):
-    degree = 3
-    all_of_them = jax.vmap(lambda turn: rotation.matrix(turn, degree=degree))
-    matrix = all_of_them(jnp.asarray(EVERY))
-    expected = np.broadcast_to(np.eye((degree + 1) ** 2), matrix.shape)
-    close(matrix @ jnp.swapaxes(matrix, 1, 2), expected)
-    close(all_of_them(jnp.swapaxes(jnp.asarray(EVERY), 1, 2)), jnp.swapaxes(matrix, 1, 2))
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_identity_changes_nothing(dtype, x64, close):
-    coefficient = normal(5, 64, 3, dtype=dtype)
-    close(rotation.rotate(coefficient, jnp.eye(3, dtype=dtype)), coefficient)
-
-
 def test_turns_about_z_are_the_rotations_about_z(x64, close):
     coefficient, angle = normal(25, 64, 2), 0.9
     turn = jnp.asarray(Rotation.from_euler("z", angle).as_matrix())
@@ -138,40 +104,6 @@ def test_bands_do_not_mix(x64):
     for l in range(9):
         matrix[l * l : (l + 1) ** 2, l * l : (l + 1) ** 2] = 0
     np.testing.assert_array_equal(matrix, 0)
-
-
-def low_matrix(rotation, *, degree):
-    """Rotation matrix D(R) of SH coefficients for degrees up to 2, as polynomials in the entries of R.
-
-    The block of band 1 is R with its axes in the order y, z, x. A function of band 2 is s^T Q s with a symmetric,
-    trace-free matrix Q, so the entries of its block are sums of products of two entries of R. Derivatives are those of
-    the polynomials.
-
-    Reference: Kautz, Sloan, Snyder 2002, appendix, first method.
-    """
-    result = jnp.zeros((*rotation.shape[:-2], 9, 9), rotation.dtype).at[..., 0, 0].set(1)
-    axis = np.array([1, 2, 0])
-    result = result.at[..., 1:4, 1:4].set(rotation[..., axis[:, None], axis])
-    form = jnp.asarray(_QUADRATIC, rotation.dtype)
-    turned = jnp.einsum("...ji,mjk,...kl->...mil", rotation, form, rotation, precision="highest")
-    result = result.at[..., 4:, 4:].set(jnp.einsum("...mil,nil->...mn", turned, form, precision="highest"))
-    return result[..., : (degree + 1) ** 2, : (degree + 1) ** 2]
-
-
-# Basis functions of band 2 as quadratic forms of unit norm: x y, y z, 3 z^2 - 1, x z, x^2 - y^2.
-_QUADRATIC = np.zeros((5, 3, 3))
-for _row, (_i, _j) in ((0, (0, 1)), (1, (1, 2)), (3, (0, 2))):
-    _QUADRATIC[_row, _i, _j] = _QUADRATIC[_row, _j, _i] = np.sqrt(1 / 2)
-_QUADRATIC[2] = np.diag([-1, -1, 2]) / np.sqrt(6)
-_QUADRATIC[4] = np.diag([1, -1, 0]) / np.sqrt(2)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2])
-def test_the_polynomial_form_is_the_same_matrix(degree, x64, close):
-    every = jnp.concatenate([jnp.asarray(EVERY), rotations(7, 20), jnp.asarray(list(MIRROR.values()))])
-    expected = jax.vmap(lambda turn: rotation.matrix(turn, degree=degree))(every)
-    close(low_matrix(every, degree=degree), expected)
-    close(low_matrix(every[-1], degree=degree), expected[-1])
 
 
 def test_the_quarter_turn_about_x_takes_z_to_y_and_y_to_minus_z(x64, close):
@@ -262,12 +194,6 @@ def test_second_derivatives_along_a_turn_are_those_of_finite_differences(x64, cl
         close(reverse(0.0, matrix), np.sum(weight * expected), tolerance=SECOND_DIFFERENCE)
 
 
-def test_the_gradient_by_the_coefficients_is_the_rotation_back(x64, close):
-    turn, weight = rotations(19, 1)[0], normal(20, 16, 2)
-    gradient = jax.grad(lambda c: jnp.sum(weight * rotation.rotate(c, turn)))(normal(21, 16, 2))
-    close(gradient, rotation.rotate(weight, turn.T))
-
-
 def test_gradients_of_many_at_once_are_those_of_each_alone_in_either_precision(x64, close):
     coefficient, weight = normal(22, 16, 2), normal(23, 16, 2, len(EVERY))
     gradient = jax.jit(jax.grad(lambda r, c, g: jnp.sum(g * rotation.rotate_each(c, r))))
@@ -276,15 +202,6 @@ def test_gradients_of_many_at_once_are_those_of_each_alone_in_either_precision(x
     close(expected, alone(jnp.asarray(EVERY), weight))
     single = (jnp.asarray(array, jnp.float32) for array in (EVERY, coefficient, weight))
     close(gradient(*single), expected)
-
-
-def test_the_polynomial_form_has_the_derivatives_of_the_other_along_rotations(x64, close):
-    weight, w = normal(24, 9, 9), cross_matrix([0.2, 0.9, -0.4])
-    for matrix in EVERY:
-        tangent = (jnp.asarray(w @ matrix),)
-        _, low = jax.jvp(lambda r: jnp.sum(weight * low_matrix(r, degree=2)), (jnp.asarray(matrix),), tangent)
-        _, full = jax.jvp(lambda r: jnp.sum(weight * rotation.matrix(r, degree=2)), (jnp.asarray(matrix),), tangent)
-        close(low, full)
 
 
 def test_wrong_numbers_are_refused_by_what_was_required_and_what_came(unchecked):

@@ -1,6 +1,6 @@
 """Renders by Mitsuba what the two comparison files beside this one hold jaxprt to.
 
-Run ``python tests/relight/make_mitsuba.py`` again when the scene, the light or the models of a comparison change; a
+Run ``python tests/systems/make_mitsuba.py`` again when the scene, the light or the models of a comparison change; a
 live rendering in each file tells when that is due.
 """
 

@@ -19,7 +19,6 @@ from jaxprt.visibility.blocks import Run
 SIZE = 8
 ALL = 6 * SIZE**2
 COUNT = 6
-SLOPE = 1e-4  # Derivatives in float32 of a lobe of exponent 80.
 EYE = jnp.array([1.0, 2.0, 3.0])
 GLOSSY = AshikhminShirley(diffuse=[0.3, 0.2, 0.1], specular=[0.2, 0.4, 0.5], nu=20.0, nv=80.0)
 GRAY = AshikhminShirley(diffuse=0.3, specular=0.4, nu=20.0, nv=80.0)
@@ -67,16 +66,6 @@ def exact(transport, brdf, light, eye=EYE):
 shine = jax.jit(bright_texels.radiance)  # one program; outside of programs it looks at values as well
 
 
-@jax.jit
-def weighed(brdf, excess, eye, texel, transport, weight):
-    """A sum over vertices and colors, with its slopes by the BRDF, the excess and the eye."""
-
-    def total(brdf, excess, eye):
-        return jnp.vdot(weight, bright_texels.radiance(transport, brdf, texel, excess, eye=eye))
-
-    return jax.value_and_grad(total, (0, 1, 2))(brdf, excess, eye)
-
-
 @pytest.mark.parametrize("colors", [1, 3])
 @pytest.mark.parametrize("strength", [1e-20, 1.0, 1e28])
 def test_excess_and_rest_are_the_light(random, colors, strength):
@@ -93,7 +82,7 @@ def test_excess_and_rest_are_the_light(random, colors, strength):
     np.testing.assert_array_equal(untouched, radiance.reshape(ALL, -1)[order[COUNT:]])
 
 
-@pytest.mark.parametrize("count", [1, 5, 40, 300])
+@pytest.mark.parametrize("count", [1, 40, 300])
 @pytest.mark.parametrize("kind", ["random", "constant", "few"])
 def test_the_brightest_are_taken_and_of_equal_ones_the_first(random, kind, count):
     brightness = {
@@ -114,13 +103,6 @@ def test_a_texel_keeps_its_color(random):
     for part in (np.asarray(excess)[:-1], np.asarray(rest.radiance).reshape(ALL, 3)[texel[:-1]]):
         part = part / part.sum(1, keepdims=True)
         np.testing.assert_allclose(part, before[:-1] / before[:-1].sum(1, keepdims=True), rtol=1e-3)
-
-
-def test_no_light_has_no_excess():
-    black = Environment(jnp.zeros((6, SIZE, SIZE, 3)))
-    _, excess, rest = bright_texels.split(black, count=COUNT)
-    assert not np.asarray(excess).any()
-    assert not np.asarray(rest.radiance).any()
 
 
 def test_texels_of_equal_flux_have_no_excess():
@@ -205,21 +187,6 @@ def test_excess_and_rest_light_as_the_light_did(transport, sky, close, colored):
     assert np.count_nonzero(np.asarray(bright).any(1)) > 10
 
 
-@pytest.mark.parametrize("brdf", [GLOSSY, Lambert([0.8, 0.5, 0.2])], ids=["glossy", "Lambert"])
-def test_a_sun_in_one_texel_is_that_of_the_reference(mesh, transport, brdf):
-    place = (2, 3, 5)
-    texel = np.ravel_multi_index(place, (6, SIZE, SIZE))
-    light = Environment(jnp.zeros((6, SIZE, SIZE, 3)).at[place].set(jnp.array([300.0, 200, 100])))
-    found, excess, _ = bright_texels.split(light, count=COUNT)
-    assert found[0] == texel
-    color = np.asarray(shine(transport, brdf, found, excess, eye=EYE))
-    expected = np.asarray(reference.radiance(mesh, brdf, light, eye=EYE, error=np.inf))
-    # Nine sixteenths are kept as eight; no vertex here sees that much of this texel.
-    assert 0.5 not in np.asarray(transport.visible(jnp.array([texel])))
-    np.testing.assert_allclose(color, expected, atol=1e-5 * expected.max())
-    assert np.count_nonzero(expected.any(1)) > 5
-
-
 def test_what_vertices_see_of_the_texels_may_be_looked_up_before_or_with_the_view(mesh, transport, sky, close):
     nothing = harmonic.DiffuseSystem(harmonic.precompute_diffuse(mesh, size=SIZE), jnp.zeros(3))
     system = bright_texels.BrightTexels(nothing, transport, GLOSSY, count=COUNT)
@@ -281,21 +248,6 @@ def test_texels_in_any_order_and_twice_over_add_up(transport, sky, close):
     same = jnp.full(COUNT, texel[0])
     once = shine(transport, GLOSSY, same, excess * jnp.eye(COUNT)[0][:, None], eye=EYE)
     close(shine(transport, GLOSSY, same, jnp.tile(excess[:1] / COUNT, (COUNT, 1)), eye=EYE), once)
-
-
-def test_slopes_are_those_of_the_reference(transport, sky, random, close):
-    """Of the BRDF's parameters, the excess and the eye."""
-    texel, excess, _ = bright_texels.split(sky, count=COUNT)
-    weight = jnp.asarray(random.normal(size=(39, 3)), jnp.float32)
-
-    def theirs(brdf, excess, eye):
-        return jnp.vdot(weight, exact(transport, brdf, whole(texel, excess), eye))
-
-    _, found = weighed(GLOSSY, excess, EYE, texel, transport, weight)
-    expected = jax.jit(jax.grad(theirs, (0, 1, 2)))(GLOSSY, excess, EYE)
-    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        assert np.any(other)
-        close(one, other, tolerance=SLOPE)
 
 
 def test_texels_and_excess_of_whole_numbers_count_as_such_and_those_of_another_light_are_refused(

@@ -8,13 +8,11 @@ own: half Lambert, half a GGX conductor, whose formula stands here too.
 
 import math
 import pathlib
-from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import trimesh
 from jaxtyping import Array, Float
 
 import jaxprt as prt
@@ -23,17 +21,13 @@ from benchmarks.published.interreflection import interreflect, interreflect_diff
 from jaxprt import harmonic
 from jaxprt.scene.environment import environment_from_image
 from jaxprt.systems.harmonic import precompute, precompute_diffuse, tabulate
+from tests.systems import rendered
+from tests.systems.rendered import EYE, LIVE, RENDERINGS, STALE
 
 DEGREE = 4
 BOUNCES = 2
 BOUNCED = 8  # edge of the cubemaps of rays that collect reflected light
-EYE = np.array([0.8, 2.4, 3.1])
-RENDERINGS = 16
 SAMPLES = 1 << 16
-# A rendering of this many samples is made live. Seeds are the same as in what is kept, which must differ by less: a
-# path that rounding sends elsewhere changes one sample of 64.
-LIVE = 64
-STALE = 0.01
 KEPT = pathlib.Path(__file__).with_name("harmonic_mitsuba.npz")
 ALBEDO = [0.8, 0.5, 0.3]
 SPECULAR = [0.9, 0.8, 0.6]
@@ -45,17 +39,8 @@ TOLERANCE = 0.01
 # No single vertex may be off by more of the mean radiance: bounces come from 331 vertices, by one ray per texel.
 # Measured at most 2.7 % beyond three standard errors.
 SINGLE = 0.03
-
-SKY = np.array([0.05, 0.06, 0.08])
-LOBES = [  # Direction and color; all so broad that a thousandth of them lies above degree 4.
-    ((1.0, 0.4, 0.1), (3.0, 0.2, 0.1)),
-    ((-0.9, 0.5, 0.3), (0.1, 2.0, 0.3)),
-    ((0.2, 1.0, -0.1), (0.6, 0.5, 1.5)),
-    ((0.1, 0.3, 1.0), (0.1, 0.4, 3.0)),
-    ((-0.2, 0.2, -1.0), (1.5, 1.5, 0.1)),
-    ((0.3, -1.0, 0.4), (0.2, 1.0, 1.0)),
-]
-SHARPNESS = 2.0
+# Lobes so broad that a thousandth of them lies above degree 4.
+IMAGE, MITSUBA_IMAGE = rendered.pictures(128, 2.0)
 
 
 def relight(transport, table, light, *, eye):
@@ -64,25 +49,6 @@ def relight(transport, table, light, *, eye):
 
 def diffuse(transport, albedo, light):
     return prt.radiance(harmonic.DiffuseSystem(transport, albedo), light, eye=jnp.zeros(3))
-
-
-def latlong(latitude):
-    """The sky as a picture twice as wide as high: centre column +z, a quarter of the width +x; rows as given."""
-    width = 2 * len(latitude)
-    longitude = np.pi * (1 - 2 * (np.arange(width) + 0.5) / width)
-    latitude, longitude = np.meshgrid(latitude, longitude, indexing="ij")
-    across = np.cos(latitude)
-    direction = np.stack([np.sin(longitude) * across, np.sin(latitude), np.cos(longitude) * across], -1)
-    total = np.broadcast_to(SKY, direction.shape)
-    for axis, color in LOBES:
-        axis = np.array(axis) / np.linalg.norm(axis)
-        total = total + np.exp(SHARPNESS * (direction @ axis - 1))[..., None] * np.array(color)
-    return total.astype(np.float32)
-
-
-# Rows from +y to -y: ours are boxes that fill the sphere, Mitsuba's are samples of which the first and last are poles.
-IMAGE = latlong(np.pi * (0.5 - (np.arange(128) + 0.5) / 128))
-MITSUBA_IMAGE = latlong(np.linspace(np.pi / 2, -np.pi / 2, 128))
 
 
 class HalfGgx(eqx.Module):
@@ -126,52 +92,13 @@ GLOSSY = {
 GLOSS = HalfGgx(jnp.asarray(ALBEDO), jnp.asarray(SPECULAR), jnp.asarray(ALPHA))
 
 
-class Scene(NamedTuple):
-    """What both sides see."""
-
-    position: np.ndarray
-    face: np.ndarray
-    normal: np.ndarray
-    vertex: np.ndarray
-
-    def mesh(self):
-        """For ours, one region."""
-        normal = jnp.asarray(self.normal)
-        tangent = prt.sphere.directions.tangent(normal)
-        region = jnp.zeros(len(normal), jnp.int32)
-        return prt.scene.Mesh(jnp.asarray(self.position), jnp.asarray(self.face), normal, tangent, region)
-
-
 @pytest.fixture(scope="module")
 def scene():
     return build_scene()
 
 
 def build_scene():
-    """A sphere of radius 0.5 that floats over a ground of 13 x 13 vertices; vertices in light, penumbra and shadow."""
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
-    center = np.array([0.0, 0.8, 0.0])
-    side = 13
-    x, z = np.meshgrid(np.linspace(-1.5, 1.5, side), np.linspace(-1.5, 1.5, side), indexing="ij")
-    ground = np.stack([x, 0 * x, z], -1).reshape(-1, 3)
-    corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()[:, None]
-    first, second = corner + np.array([0, 1, side]), corner + np.array([1, side + 1, side])
-    position = np.concatenate([ground, ball.vertices + center])
-    face = np.concatenate([first, second, ball.faces + len(ground)])
-    up = np.broadcast_to([0.0, 1.0, 0.0], ground.shape)
-    normal = np.concatenate([up, ball.vertices / np.linalg.norm(ball.vertices, axis=1, keepdims=True)])
-    # Under the sphere, beside it, away from it; and around the visible side of the sphere.
-    asked = np.array([[0.0, 0, 0.25], [0.5, 0, 0], [-0.5, 0, 0.25], [0.25, 0, 0.75], [-0.75, 0, -0.5], [1.25, 0, 1.25]])
-    angle = np.array(
-        [[0.1, 1.2], [0.9, 0.9], [-0.8, 0.7], [0.3, 0.3], [1.6, 0.5], [0.2, -0.3], [-1.0, 0.1], [1.0, -0.1]]
-    )
-    longitude, latitude = angle.T
-    around = np.stack(
-        [np.sin(longitude) * np.cos(latitude), np.sin(latitude), np.cos(longitude) * np.cos(latitude)], -1
-    )
-    asked = np.concatenate([asked, center + 0.5 * around])
-    vertex = np.array([np.argmin(np.linalg.norm(position - point, axis=1)) for point in asked])
-    return Scene(position.astype(np.float32), face.astype(np.int32), normal.astype(np.float32), vertex)
+    return rendered.ball_over_ground(subdivisions=2, height=0.8)
 
 
 @pytest.fixture(scope="module")
@@ -196,46 +123,8 @@ def cases():
     }
 
 
-def render(mi, scene, *, bsdf, bounces, samples, seeds):
-    """Radiance towards the eye from points next to the vertices, in independent renderings, [rendering, v, 3]."""
-    props = mi.Properties()
-    props["bsdf"] = mi.load_dict(bsdf)
-    mesh = mi.Mesh("mesh", len(scene.position), len(scene.face), has_vertex_normals=True, props=props)
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = scene.position.ravel()
-    parameters["vertex_normals"] = scene.normal.ravel()
-    parameters["faces"] = scene.face.ravel()
-    parameters.update()
-    sensors = {f"sensor{i:02}": _meter(*ray) for i, ray in enumerate(rays(scene))}
-    world = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "path", "max_depth": 2 + bounces, "rr_depth": 100},
-            "sensor": {"type": "batch", "film": _film(len(sensors)), **sensors},
-            "light": {"type": "envmap", "bitmap": mi.Bitmap(MITSUBA_IMAGE)},
-            "mesh": mesh,
-        }
-    )
-    return np.stack([np.array(mi.render(world, spp=samples, seed=i))[0] for i in seeds])
-
-
-def rays(scene):
-    """From a little off the surface, on the way from the eye, to a point just inside a triangle at each vertex."""
-    for vertex in scene.vertex:
-        point, normal = scene.position[vertex].astype(float), scene.normal[vertex]
-        face = scene.face[np.flatnonzero((scene.face == vertex).any(1))[0]]
-        target = point + 1e-3 * (scene.position[face].mean(0) - point)
-        assert normal @ (EYE - point) > 0.1, "the vertex must look at the eye"
-        yield target + 0.02 * (EYE - point), target
-
-
-def _meter(origin, target):
-    direction = (target - origin).tolist()
-    return {"type": "radiancemeter", "origin": origin.tolist(), "direction": direction, "film": _film(1)}
-
-
-def _film(width):
-    return {"type": "hdrfilm", "width": width, "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+def render(mi, scene, **options):
+    return rendered.render(mi, scene, MITSUBA_IMAGE, **options)
 
 
 def excess(actual, mean, error):

@@ -1,4 +1,4 @@
-"""The reference against itself: batches, selections, linearity, closed forms. Mitsuba judges it elsewhere."""
+"""The reference against itself: batches, selections, closed forms. Mitsuba judges it elsewhere."""
 
 import equinox as eqx
 import jax
@@ -11,14 +11,12 @@ from jaxprt import reference, visibility
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.scene import Environment
-from jaxprt.scene.environment import rotate
 from jaxprt.sphere import cubemap, directions
 
 SIZE = 8
 EYE = jnp.array([2.0, 3.0, 4.0])
 HORIZON = 1e-2  # Texels of 8 x 8 faces that the horizon cuts: measured .7 % at worst.
 GRADIENT = 1e-2  # Differences of sums in float32 over a step of a fortieth.
-TURNED = 1e-4  # Rays along rotated directions meet edges on either side by rounding.
 CENTERS = np.inf  # The error that leaves one point to each texel: sums are then equal, not close.
 GLOSSY = AshikhminShirley(diffuse=[0.6, 0.2, 0.1], specular=0.3, nu=20, nv=60)
 
@@ -108,44 +106,6 @@ def test_vertices_do_not_depend_on_who_else_is_asked_for(mesh, random, close, co
     close(reference.radiance(mesh, GLOSSY, light, eye=EYE, vertex=vertex), whole[vertex])
 
 
-def test_radiance_is_linear_in_light_and_albedo(random, close):
-    arrays = hemisphere(random)
-    first, second = some_light(random), some_light(random)
-
-    def of(light, albedo=0.5):
-        return reference.integrate(*arrays, Lambert(albedo), light, EYE, error=CENTERS)
-
-    close(of(Environment(2 * first.radiance - second.radiance)), 2 * of(first) - of(second))
-    close(of(first, [0.1, 0.2, 0.3]), of(first, 1.0) * jnp.array([0.1, 0.2, 0.3]))
-
-
-def test_each_channel_of_the_light_reaches_only_itself(random):
-    arrays, light = hemisphere(random), some_light(random)
-    whole = reference.integrate(*arrays, GLOSSY, light, EYE, error=CENTERS)
-    for channel in range(3):
-        alone = Environment(light.radiance * (jnp.arange(3) == channel))
-        color = reference.integrate(*arrays, GLOSSY, alone, EYE, error=CENTERS)
-        np.testing.assert_array_equal(color[:, channel], whole[:, channel])
-        assert not np.delete(np.asarray(color), channel, axis=1).any()
-
-
-def test_eyes_below_the_horizon_see_what_grazing_eyes_see(random, close):
-    (seen, position, frame), light = hemisphere(random), some_light(random)
-    for vertex in range(3):
-        tangent, _, normal = frame[vertex]
-        beneath, grazing = (
-            reference.integrate(seen, position, frame, GLOSSY, light, position[vertex] + tangent + height * normal)
-            for height in (-3, 0.005)
-        )
-        close(beneath[vertex], grazing[vertex])
-
-
-def test_eyes_in_odd_places_give_finite_radiance(mesh, random):
-    for eye in (mesh.position[7], [0, 0, 0], [0.3, -0.2, 0.4], [1e15, 1e15, -1e15], mesh.position[7] * (1 + 1e-6)):
-        color = reference.radiance(mesh, GLOSSY, some_light(random), eye=jnp.asarray(eye, jnp.float32))
-        assert np.isfinite(color).all()
-
-
 def test_gray_brdfs_and_gray_lights_give_what_their_colors_would(random, close):
     arrays, light = hemisphere(random), some_light(random)
     close(
@@ -158,15 +118,6 @@ def test_gray_brdfs_and_gray_lights_give_what_their_colors_would(random, close):
         reference.integrate(*arrays, GLOSSY, gray, EYE, error=CENTERS),
         reference.integrate(*arrays, GLOSSY, Environment(jnp.repeat(gray.radiance, 3, -1)), EYE, error=CENTERS),
     )
-
-
-def test_blocked_vertices_are_black_and_shadows_only_darken(mesh, random):
-    light = some_light(random)
-    alone = prt.scene.mesh.split(mesh)[0]
-    shadowed = np.asarray(reference.radiance(alone, Lambert(0.5), light, eye=EYE, occluder=mesh))
-    free = np.asarray(reference.radiance(alone, Lambert(0.5), light, eye=EYE))
-    assert (shadowed <= free * (1 + 1e-5) + 1e-5).all()
-    assert (shadowed < 0.9 * free).any()
 
 
 @pytest.mark.parametrize("brdf", [Lambert(0.5), PerVertex(Lambert(np.full((122, 1), 0.5, np.float32)))], ids=type)
@@ -187,20 +138,6 @@ def test_texels_that_matter_less_than_the_error_have_one_ray_where_the_surface_i
     assert no_count == 0 < coarse_count < 0.8 * fine_count
     assert 0 < np.linalg.norm(coarse - fine) < 0.02 * np.linalg.norm(fine)
     assert np.linalg.norm(coarse - fine) < np.linalg.norm(none - fine)
-
-
-@pytest.mark.parametrize("brdf", [Lambert(0.5), GLOSSY], ids=["lambert", "glossy"])
-def test_a_quarter_turn_of_everything_changes_nothing(mesh, brdf, random, close):
-    light = some_light(random)
-    turn = jnp.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
-    fields = (mesh.position, mesh.normal, mesh.tangent)
-    turned = eqx.tree_at(lambda m: (m.position, m.normal, m.tangent), mesh, tuple(each @ turn.T for each in fields))
-    vertex = np.arange(0, 121, 2)
-    close(
-        reference.radiance(turned, brdf, rotate(light, turn), eye=turn @ EYE, vertex=vertex, error=CENTERS),
-        reference.radiance(mesh, brdf, light, eye=EYE, vertex=vertex, error=CENTERS),
-        tolerance=TURNED,
-    )
 
 
 def test_any_function_of_two_directions_is_a_brdf(mesh, random, close):

@@ -8,82 +8,27 @@ it finds is kept beside this file; `make_mitsuba.py` writes it.
 
 import math
 import pathlib
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import trimesh
 
 import jaxprt as prt
 from jaxprt.scene import Environment
 from jaxprt.scene.environment import environment_from_image
+from tests.systems import rendered
+from tests.systems.rendered import EYE, LIVE, RENDERINGS, STALE
 
 SIZE = 64  # Texels along the edge of the reference's cubemap.
 # A sum over texels and sixteenths of visibility against an integral: with 2^20 samples, 0.1 % of Mitsuba's noise, the
 # Lambert values differ by at most 0.6 %, where a vertex sees little light. Three standard errors are added.
 TOLERANCE = 0.01
-EYE = np.array([0.8, 2.4, 3.1])
-RENDERINGS = 16
-# A rendering of this many samples is made live. Seeds are the same as in what is kept, which must differ by less: a
-# path that rounding sends elsewhere changes one sample of 64.
-LIVE = 64
-STALE = 0.01
 KEPT = pathlib.Path(__file__).with_name("reference_mitsuba.npz")
 ALBEDO = [0.8, 0.5, 0.3]
 GLOSSY = {"diffuse": 0.5, "specular": 0.75, "nu": 10.0, "nv": 100.0}
-
-SKY = np.array([0.05, 0.06, 0.08])
-LOBES = [  # Direction, color, sharpness.
-    ((1.0, 0.4, 0.1), (3.0, 0.2, 0.1), 8.0),
-    ((-0.9, 0.5, 0.3), (0.1, 2.0, 0.3), 6.0),
-    ((0.2, 1.0, -0.1), (0.6, 0.5, 1.5), 10.0),
-    ((0.1, 0.3, 1.0), (0.1, 0.4, 3.0), 7.0),
-    ((-0.2, 0.2, -1.0), (1.5, 1.5, 0.1), 12.0),
-    ((0.3, -1.0, 0.4), (0.2, 1.0, 1.0), 5.0),
-]
-
-
-def sky(direction):
-    """Radiance from some directions."""
-    total = np.broadcast_to(SKY, direction.shape)
-    for axis, color, sharpness in LOBES:
-        axis = np.array(axis) / np.linalg.norm(axis)
-        total = total + np.exp(sharpness * (direction @ axis - 1))[..., None] * np.array(color)
-    return total
-
-
-def latlong(latitude):
-    """The sky as a picture twice as wide as high: centre column +z, a quarter of the width +x; rows as given."""
-    width = 2 * len(latitude)
-    longitude = np.pi * (1 - 2 * (np.arange(width) + 0.5) / width)
-    latitude, longitude = np.meshgrid(latitude, longitude, indexing="ij")
-    across = np.cos(latitude)
-    return sky(np.stack([np.sin(longitude) * across, np.sin(latitude), np.cos(longitude) * across], -1)).astype(
-        np.float32
-    )
-
-
-# Rows from +y to -y: ours are boxes that fill the sphere, Mitsuba's are samples of which the first and last are poles.
-IMAGE = latlong(np.pi * (0.5 - (np.arange(256) + 0.5) / 256))
-MITSUBA_IMAGE = latlong(np.linspace(np.pi / 2, -np.pi / 2, 256))
-
-
-class Scene(NamedTuple):
-    """What both sides see."""
-
-    position: np.ndarray
-    face: np.ndarray
-    normal: np.ndarray
-    vertex: np.ndarray
-
-    def mesh(self):
-        """For the reference, with Wang's tangents."""
-        normal = jnp.asarray(self.normal)
-        tangent = prt.sphere.directions.tangent(normal)
-        region = jnp.zeros(len(normal), jnp.int32)
-        return prt.scene.Mesh(jnp.asarray(self.position), jnp.asarray(self.face), normal, tangent, region)
+SHARPNESS = [8.0, 6.0, 10.0, 7.0, 12.0, 5.0]  # of the lobes of the sky
+IMAGE, MITSUBA_IMAGE = rendered.pictures(256, SHARPNESS)
 
 
 @pytest.fixture(scope="module")
@@ -92,30 +37,7 @@ def scene():
 
 
 def build_scene():
-    """A sphere of radius 0.5 that floats over a ground of 13 x 13 vertices; vertices in light, penumbra and shadow."""
-    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
-    center = np.array([0.0, 0.6, 0.0])
-    side = 13
-    x, z = np.meshgrid(np.linspace(-1.5, 1.5, side), np.linspace(-1.5, 1.5, side), indexing="ij")
-    ground = np.stack([x, 0 * x, z], -1).reshape(-1, 3)
-    corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()[:, None]
-    first, second = corner + np.array([0, 1, side]), corner + np.array([1, side + 1, side])
-    position = np.concatenate([ground, ball.vertices + center])
-    face = np.concatenate([first, second, ball.faces + len(ground)])
-    up = np.broadcast_to([0.0, 1.0, 0.0], ground.shape)
-    normal = np.concatenate([up, ball.vertices / np.linalg.norm(ball.vertices, axis=1, keepdims=True)])
-    # Under the sphere, beside it, away from it; and around the visible side of the sphere.
-    asked = np.array([[0.0, 0, 0.25], [0.5, 0, 0], [-0.5, 0, 0.25], [0.25, 0, 0.75], [-0.75, 0, -0.5], [1.25, 0, 1.25]])
-    angle = np.array(
-        [[0.1, 1.2], [0.9, 0.9], [-0.8, 0.7], [0.3, 0.3], [1.6, 0.5], [0.2, -0.3], [-1.0, 0.1], [1.0, -0.1]]
-    )
-    longitude, latitude = angle.T
-    around = np.stack(
-        [np.sin(longitude) * np.cos(latitude), np.sin(latitude), np.cos(longitude) * np.cos(latitude)], -1
-    )
-    asked = np.concatenate([asked, center + 0.5 * around])
-    vertex = np.array([np.argmin(np.linalg.norm(position - point, axis=1)) for point in asked])
-    return Scene(position.astype(np.float32), face.astype(np.int32), normal.astype(np.float32), vertex)
+    return rendered.ball_over_ground(subdivisions=4, height=0.6)
 
 
 @pytest.fixture(scope="module")
@@ -223,50 +145,8 @@ def cases():
     }
 
 
-def render(mi, scene, *, bsdf, samples, seeds):
-    """Radiance towards the eye from points next to the vertices, in independent renderings, [rendering, v, 3]."""
-    mesh = mi.Mesh("mesh", len(scene.position), len(scene.face), has_vertex_normals=True, props=_props(mi, bsdf))
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = scene.position.ravel()
-    parameters["vertex_normals"] = scene.normal.ravel()
-    parameters["faces"] = scene.face.ravel()
-    parameters.update()
-    sensors = {f"sensor{i:02}": _meter(mi, *ray) for i, ray in enumerate(rays(scene))}
-    world = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "path", "max_depth": 2},
-            "sensor": {"type": "batch", "film": _film(len(sensors)), **sensors},
-            "light": {"type": "envmap", "bitmap": mi.Bitmap(MITSUBA_IMAGE)},
-            "mesh": mesh,
-        }
-    )
-    return np.stack([np.array(mi.render(world, spp=samples, seed=i))[0] for i in seeds])
-
-
-def _props(mi, bsdf):
-    props = mi.Properties()
-    props["bsdf"] = mi.load_dict(bsdf)
-    return props
-
-
-def rays(scene):
-    """From a little off the surface, on the way from the eye, to a point just inside a triangle at each vertex."""
-    for vertex in scene.vertex:
-        point, normal = scene.position[vertex].astype(float), scene.normal[vertex]
-        face = scene.face[np.flatnonzero((scene.face == vertex).any(1))[0]]
-        target = point + 1e-3 * (scene.position[face].mean(0) - point)
-        assert normal @ (EYE - point) > 0.1, "the vertex must look at the eye"
-        yield target + 0.02 * (EYE - point), target
-
-
-def _meter(mi, origin, target):
-    direction = (target - origin).tolist()
-    return {"type": "radiancemeter", "origin": origin.tolist(), "direction": direction, "film": _film(1)}
-
-
-def _film(width):
-    return {"type": "hdrfilm", "width": width, "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+def render(mi, scene, **options):
+    return rendered.render(mi, scene, MITSUBA_IMAGE, **options)
 
 
 def excess(actual, mean, error):
@@ -347,7 +227,7 @@ def test_environment_looks_the_same_in_every_direction(mitsuba, light):
         theirs.append(list(map_of_mitsuba.eval(seen)))
     ours = prt.scene.environment.background(light, jnp.asarray(direction, jnp.float32))
     # Texel means and bilinear interpolation soften the sharpest lobe by so much.
-    np.testing.assert_allclose(theirs, sky(direction), rtol=2e-3)
+    np.testing.assert_allclose(theirs, rendered.sky(direction, SHARPNESS), rtol=2e-3)
     np.testing.assert_allclose(ours, theirs, rtol=1e-2)
 
 

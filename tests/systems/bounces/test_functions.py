@@ -33,10 +33,9 @@ def sent(members, terms, weight):
     return jnp.stack([exact(each) for each in members]), by_functions
 
 
-@pytest.mark.parametrize(("functions", "terms"), [(2, 6), (3, 12)])
-def test_the_error_of_functions_is_that_of_what_they_send(functions, terms):
+def test_the_error_of_functions_is_that_of_what_they_send():
     """Relative L2 error of the light that each BRDF sends, over all BRDFs."""
-    shared, weight = bounces.functions.shared(MEMBERS, functions=functions, terms=terms, resolution=RESOLUTION)
+    shared, weight = bounces.functions.shared(MEMBERS, functions=2, terms=6, resolution=RESOLUTION)
     exact, by_functions = sent(MEMBERS, shared, weight)
     size = np.linalg.norm(exact, axis=(1, 2))
     missed = np.linalg.norm(by_functions - exact, axis=(1, 2)) / size

@@ -111,20 +111,6 @@ def test_what_arrives_is_a_loop_over_rays(mesh, seen, frame, met):
     assert relative(colored, exact) < 1e-5
 
 
-def test_two_bounces_are_nearly_those_of_the_harmonic_system(mesh, seen, frame, met):
-    """What arrives first is held by 16 harmonics, which is where they differ."""
-    white = bounces.functions.basis(separable.factor(Lambert(1.0), terms=1, resolution=8))
-    response = jnp.sum(bounces.gather.respond(seen, frame, white, edge=EDGE), 1, keepdims=True)
-    arriving = sum(arrived(response, frame, white, met[r], shining(3))[:, :, 0] * ALBEDO[r] for r in (0, 1))
-    again = bounces.gather.respond_again(jnp.asarray(np.moveaxis(arriving, 0, -1)), frame, white)
-    found = sum(arrived(again, frame, white, met[r], flux(mesh))[:, 0, 0] * ALBEDO[r] for r in (0, 1))
-    plain = harmonic.precompute_diffuse(mesh, degree=0, size=SIZE)
-    options = {"size": SIZE}
-    one, two = (interreflect_diffuse(mesh, plain, ALBEDO, bounces=n, **options) for n in (1, 2))
-    exact = np.asarray(two.vector - one.vector)[0].T * np.sqrt(4 * np.pi)
-    assert relative(found, exact) < 0.011
-
-
 def test_in_a_closed_furnace_light_falls_as_the_geometric_series():
     """A hollow sphere, seen from inside: after n bounces of albedo .7 light is .7^n of what shone at first."""
     ball = builtin.sphere(rings=16, sectors=24)

@@ -10,7 +10,7 @@ import pytest
 from jaxprt import bounces, reference, separable
 from jaxprt.brdf import Lambert
 from jaxprt.scene import Environment, builtin
-from jaxprt.scene.mesh import ground_plane, join, make_mesh
+from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.sphere import cubemap
 from tests.systems.bounces.reflected import of_regions, radiance
 
@@ -139,10 +139,3 @@ def test_one_vertex_alone_in_a_region():
     _, more, _ = bounced(scene(near, far), [1.0, 1.0])
     assert more[:REGION].max() > 0.05
     assert np.abs(more[REGION:]).max() < 1e-3
-
-
-def test_the_ground_of_a_real_scene_may_be_a_plane_of_two_triangles():
-    """Vertices at the far corners alone: what they do not see is not lit, and nothing is lost."""
-    mesh = scene(ball(), ground_plane(ball(), vertices=9))
-    _, more, _ = bounced(mesh, [0.5, 0.5])
-    assert more.max() > 0.01

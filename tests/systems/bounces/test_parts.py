@@ -15,14 +15,13 @@ import numpy as np
 import pytest
 
 import jaxprt as prt
-from benchmarks.published.interreflection import interreflect_diffuse
 from jaxprt import bounces, harmonic, separable
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.brdf.varying import Channels
 from jaxprt.relit import paths, reflection
 from jaxprt.relit.channels import of_part
 from jaxprt.scene import Environment, Mesh, TexturedMaterial, builtin
-from jaxprt.scene.mesh import ground_plane, join, make_mesh
+from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart
 from tests.systems.bounces.reflected import of_regions, radiance
 
@@ -87,35 +86,6 @@ def test_parts_of_one_group_send_what_they_send_in_groups_of_their_own(close):
     wide = np.pad(np.concatenate([ends[2], ends[0]]), ((0, 20), (0, 0), (0, 0)), mode="edge")
     found = joined.radiance(SKY, [prt.Blend(wide), prt.Blend(ends[1])])
     close(np.concatenate([found[72:108], found[128:], found[:72]]), expected, tolerance=1e-5)
-
-
-def test_a_bowl_has_the_light_of_the_closed_form():
-    system = made(bowl(), [Lambert(ALBEDO)], count=2, terms=1)
-    color = system.radiance(SKY)
-    inside = np.asarray(bowl().position)[:, 1] < -0.1  # At the rim half of the surface around a vertex is missing.
-    once = ALBEDO / 2
-    np.testing.assert_allclose(color[inside], once * (once + once**2), rtol=0.06)
-    np.testing.assert_allclose(color[inside].mean(), once * (once + once**2), rtol=0.02)
-
-
-def test_a_white_world_is_that_of_the_harmonic_system_and_nearly_invisible():
-    """White surfaces under constant light: what two bounces leave of radiance one is little."""
-    ball = builtin.sphere(rings=8, sectors=10)
-    mesh = join([ball, ground_plane(ball, vertices=64)])
-    white = separable.factor(Lambert(1.0), terms=1, resolution=4)
-    tensor = bounces.precompute(mesh, [white] * 2, edge=4, components=136, modes=96, size=8)
-    ones = Environment(jnp.ones((6, 8, 8, 1)))
-    facing = np.asarray(mesh.normal)[:, 1] > 0.1
-    reflected = radiance(of_regions(mesh, [Lambert(1.0)] * 2, tensor), ones, jnp.array([0.0, 50.0, 0.0]))
-    plain = harmonic.precompute_diffuse(mesh, degree=0, size=8)
-    albedo = np.ones((2, 1), np.float32)
-    exact = interreflect_diffuse(mesh, plain, albedo, bounces=2, size=8)
-    first, exact = (np.asarray(each.vector)[0, 0, facing] * np.sqrt(4 * np.pi) for each in (plain, exact))
-    both = first + np.asarray(reflected)[facing, 0]
-    assert (1 - first).max() > 0.4
-    assert np.linalg.norm(both - exact) < 0.004 * np.linalg.norm(exact)
-    assert (1 - both).min() > -0.02  # Harmonics of the first bounce ring.
-    assert np.mean(1 - both) < 0.4 * np.mean(1 - first)
 
 
 def test_what_bounces_bring_is_estimated_as_the_closed_form_has_it():

@@ -148,13 +148,6 @@ def test_two_bounces_are_a_loop_over_rays_of_rays(mesh, brdfs, whole):
 TWICE = 0.025
 
 
-def test_linear_in_the_light(whole):
-    first, second = light(0), light(1)
-    both = Environment(first.radiance + 2 * second.radiance)
-    for found, a, b in zip(*(arriving(whole, each) for each in (both, first, second)), strict=True):
-        np.testing.assert_allclose(found, a + 2 * b, atol=2e-6)
-
-
 def test_one_bounce_is_linear_in_the_weights_and_two_are_quadratic(whole):
     random = np.random.default_rng(0)
     a, b = (jnp.asarray(random.uniform(size=(3, 3)), jnp.float32) for _ in range(2))

@@ -148,12 +148,3 @@ def test_transport_of_another_brdf_is_refused(seen):
         dynamic.DynamicSystem(transport, other)
     with pytest.raises(ValueError, match="must have the transport's 4 light factors, got 0"):
         dynamic.DynamicSystem(transport, dynamic.table.without_tensor(METALLIC_ROUGHNESS.lobes()))
-
-
-def test_a_stopped_precomputation_goes_on(light, tmp_path):
-    mesh, brdf = builtin.sphere(rings=6, sectors=8), BRDFS["with a tensor"]()
-    options = {"size": SIZE, "run": prt.Run(tmp_path / "store")}
-    blend = materials(len(mesh.position), 0.5)
-    first, again = (dynamic.DynamicSystem(dynamic.precompute(mesh, brdf, **options), brdf) for _ in range(2))
-    color, same = (prt.radiance(dynamic_system, light, eye=EYE, materials=blend) for dynamic_system in (first, again))
-    np.testing.assert_allclose(color, same, rtol=1e-6)

@@ -54,12 +54,7 @@ def test_the_values_at_the_knots_are_those_of_the_brdf(whole):
     assert float(whole.error) < ERROR
 
 
-def test_more_ranks_leave_less(whole):
-    errors = [float(tabulate(lobes=0, ranks=ranks).error) for ranks in ((1, 2, 2), (2, 8, 8))]
-    assert errors[0] > errors[1] > float(whole.error)
-
-
-@pytest.mark.parametrize("ranks", [(1, 4, 4), (2, 8, 8), (3, 24, 24)])
+@pytest.mark.parametrize("ranks", [(1, 4, 4), (3, 24, 24)])
 def test_the_error_of_a_tensor_is_that_of_what_it_reflects(ranks):
     """Under a few harmonics, by a quadrature of its own. The BRDFs of the set are the channels."""
     brdf = Channels(tuple(CookTorrance(0.0, 1.0, m, 0.3) for m in (0.25, 0.4, 0.6)), jnp.ones(3))

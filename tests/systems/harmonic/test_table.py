@@ -216,16 +216,6 @@ def test_an_error_that_no_rule_reaches_is_told():
     assert 1e-9 < float(table.error) < 1
 
 
-def test_lookup_at_texels_gives_the_table(table):
-    direction = hemisphere.parabolic_texel_direction(resolution=RESOLUTION)
-    center = (np.arange(RESOLUTION) + 0.5) / RESOLUTION * 2 - 1
-    row, column = np.nonzero(center[:, None] ** 2 + center**2 < 1 - 1 / RESOLUTION)
-    assert len(row) > 100
-    actual = looked_up(table, np.asarray(direction)[row, column])
-    expected = np.asarray(table.table)[:, :, row, column]
-    assert np.linalg.norm(actual - expected) < LOOKUP * np.linalg.norm(expected)
-
-
 def test_lookup_between_texels_is_bilinear(table, random):
     view = upper(random, 300, least=1e-3)
     place = (np.asarray(view, float)[:, :2] / (1 + np.asarray(view, float)[:, 2:]) + 1) / 2 * RESOLUTION - 0.5
@@ -233,17 +223,6 @@ def test_lookup_between_texels_is_bilinear(table, random):
     expected = [scipy.ndimage.map_coordinates(each, place[:, ::-1].T, order=1, mode="nearest") for each in flat]
     actual = np.asarray(looked_up(table, view)).reshape(75, -1)
     assert np.linalg.norm(actual - np.array(expected)) < LOOKUP * np.linalg.norm(expected)
-
-
-def test_finer_tables_interpolate_better(tables, random):
-    view, brdf = upper(random, RESOLUTION**2, least=0.2), SHARPNESS["glossy"]
-    exact = project(brdf, view, degree=4, rings=24, sectors=96)
-    error = [
-        np.linalg.norm(looked_up(made, view) - exact) / np.linalg.norm(exact)
-        for made in (tabulate(brdf, resolution=6), tables("glossy"))
-    ]
-    assert error[0] > 5 * error[1]
-    assert error[1] < 0.06
 
 
 def test_views_below_the_horizon_and_on_it_see_nothing_and_gradients_are_finite(table):
@@ -337,20 +316,6 @@ def test_gray_and_colored_brdfs_of_one_table_share_its_colors():
     row = np.asarray(table.table)[0, :, :, 2]
     np.testing.assert_allclose(row[:, 0], 0.5 / np.sqrt(np.pi) / 2 * np.ones(3), rtol=1e-3)
     np.testing.assert_allclose(row[:, 1], np.array([0.5, 0.25, 0.1]) / np.sqrt(np.pi) / 2, rtol=1e-3)
-
-
-def test_any_function_is_tabulated_as_the_model_that_it_is(tables, close):
-    model = SHARPNESS["matte"]
-    plain = tabulate(lambda wi, wo: model(wi, wo), degree=1, resolution=RESOLUTION)
-    close(plain.table, np.asarray(tables("matte").table)[:4])
-
-
-def test_a_quarter_turn_about_the_normal_exchanges_the_exponents(table, random):
-    other = AshikhminShirley(diffuse=COLORED.diffuse, specular=COLORED.specular, nu=100.0, nv=10.0)
-    quarter = np.float32([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    turned = tabulate(other, resolution=RESOLUTION)
-    wi, wo = upper(random, 40), upper(random, 40, least=0.1)
-    np.testing.assert_allclose(value(turned, wi @ quarter.T, wo @ quarter.T), value(table, wi, wo), atol=2e-3)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxprt.scene import builtin
-from jaxprt.scene.mesh import join, make_mesh, rotate
+from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.sphere import cubemap, directions, harmonics, rotation
 from jaxprt.systems.harmonic import precompute, precompute_diffuse
 from jaxprt.systems.harmonic.transfer import from_visibility, to_visibility, transfer, transfer_diffuse
@@ -120,16 +120,6 @@ def test_any_visibility_gives_the_sum_over_fine_texels(random, close):
     close(transfer(seen, frame, degree=3), expected, tolerance=1e-4)
 
 
-def test_transfer_is_a_dimming_in_the_world_followed_by_the_rotation(random):
-    """M D^T is symmetric, and no function comes out with negative energy or more than it had."""
-    seen, frame = visible(random, 6).at[0].set(16).at[1, :200].set(0), frames(random, 6)
-    dimming = np.einsum("boi,boj->bij", open_matrices(frame, 4), transfer(seen, frame, degree=4))
-    np.testing.assert_allclose(dimming, dimming.swapaxes(1, 2), atol=EXACT)
-    value = np.linalg.eigvalsh((dimming + dimming.swapaxes(1, 2)) / 2)
-    assert value.min() > -EXACT
-    assert value.max() < 1 + EXACT
-
-
 @pytest.mark.parametrize("degree", [1, 4])
 def test_matrices_hold_the_harmonics_of_the_visibility_and_no_more(random, close, degree):
     frame = frames(random, 3)
@@ -140,47 +130,12 @@ def test_matrices_hold_the_harmonics_of_the_visibility_and_no_more(random, close
     close(from_visibility(to_visibility(traced, frame), frame, degree=degree), traced, tolerance=EXACT)
 
 
-def test_the_two_sides_of_a_matrix_do_not_mix_frames_and_light(random, close):
-    """Turning world, light and frame together changes nothing but the world's axis."""
-    seen, frame = visible(random, 3), frames(random, 3)
-    quarter = jnp.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], jnp.float32)
-    direction = np.asarray(cubemap.direction(size=SIZE)).reshape(-1, 3)
-    source = np.argmax(direction @ np.asarray(quarter) @ direction.T, 1)
-    turned = transfer(seen[:, source], frame @ quarter.T, degree=4)
-    expected = transfer(seen, frame, degree=4) @ rotation.matrix(quarter, degree=4).T
-    close(turned, expected, tolerance=EXACT)
-
-
-def test_the_vector_is_what_lambert_makes_of_the_matrix(random):
-    """Up to what of the cosine the harmonics do not carry."""
-    mesh = scene()
-    vector = np.asarray(precompute_diffuse(mesh, size=SIZE).vector[:, 0])
-    transport = precompute(mesh, size=SIZE)
-    cosine = harmonics.convolve(
-        harmonics.evaluate(jnp.array([0.0, 0, 1]), degree=4), harmonics.cosine(degree=4) / jnp.pi
-    )
-    made = np.einsum("o,voi->iv", cosine, transport.matrix[:, 0])
-    norm = np.linalg.norm(vector, axis=0)
-    assert norm.max() > 3 * norm[norm > 0].min() > 0, "some vertices are shadowed"
-    error = np.linalg.norm(made - vector, axis=0)
-    assert error.max() < 0.04 * norm.max()
-    np.testing.assert_allclose(made[0], vector[0], atol=0.01)
-
-
 def test_precomputed_open_vertices_have_the_rotation_to_their_frame(close):
     mesh = builtin.sphere(rings=5, sectors=8)
     transport = precompute(mesh, degree=3, size=16)
     close(transport.frame, directions.frame(mesh.normal, mesh.tangent))
     close(transport.matrix[:, 0], open_matrices(transport.frame, 3), tolerance=HORIZON)
     assert transport.nbytes == len(mesh.position) * 16**2 * 4
-
-
-def test_a_turned_mesh_has_its_transfer_turned(close):
-    quarter = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
-    mesh = scene()
-    here, there = (precompute(each, degree=2, size=SIZE) for each in (mesh, rotate(mesh, quarter)))
-    turned = rotation.matrix(jnp.asarray(quarter, jnp.float32), degree=2)
-    close(there.matrix, here.matrix @ turned.T, tolerance=HORIZON)
 
 
 @pytest.mark.parametrize("made", [precompute, precompute_diffuse])

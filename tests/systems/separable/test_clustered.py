@@ -14,7 +14,7 @@ from jaxprt import separable, visibility
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.scene import builtin
 from jaxprt.scene.mesh import join
-from jaxprt.sphere import directions, haar
+from jaxprt.sphere import haar
 from jaxprt.systems.separable import SeparableBrdf, factor
 from jaxprt.systems.separable.clustered import precompute
 from jaxprt.systems.separable.sparse import project
@@ -126,22 +126,6 @@ def test_all_components_modes_and_coefficients_are_the_uncompressed_transport(wh
     assert (whole.weight.shape, whole.terms) == ((CLUSTERS, 10, 10), TERMS)
 
 
-@pytest.fixture(scope="module")
-def expected(seen, brdf):
-    """Radiance under daylight by uncompressed transport."""
-    level = jnp.asarray(seen.seen(np.arange(VERTICES)))
-    met = np.einsum(
-        "vdrl,dc->vrc", project(level, seen.frame, brdf), separable.system.project(builtin.daylight(size=SIZE))
-    )
-    return np.sum(met * np.asarray(brdf.view(directions.view(seen.frame, seen.position, EYE))), 1)
-
-
-def test_all_of_it_lights_as_uncompressed_transport_does(whole, brdf, expected, close):
-    light = builtin.daylight(size=SIZE)
-    close(relight(whole, brdf, light), expected, tolerance=HALF)
-    assert np.count_nonzero(expected.any(1)) > 10
-
-
 def test_errors_fall_with_components_modes_and_coefficients(whole, exact):
     size = np.linalg.norm(exact)
     for name, counts in (("components", (1, 4)), ("modes", (1, 8)), ("count", (6, 100))):
@@ -224,14 +208,6 @@ def test_apply_is_the_dense_product_and_linear(small, random, close):
     close(both, jnp.stack([small.apply(light), small.apply(other)]))
 
 
-def test_derivatives_by_the_light_are_the_transposed_matrix(small, random, close):
-    light = jnp.asarray(random.normal(size=(ALL, 3)), jnp.float32)
-    value, pull = jax.vjp(small.apply, light)
-    back = random.normal(size=value.shape)
-    (found,) = pull(jnp.asarray(back, jnp.float32))
-    close(found, np.einsum("vdr,vrc->dc", by_vertex(small), back))
-
-
 def test_in_float64_only_what_is_stored_is_rounded(small, random, close, x64):
     light = random.normal(size=(ALL, 3))
     value = small.apply(jnp.asarray(light))
@@ -256,17 +232,6 @@ def test_rows_are_vertices_by_cluster_and_everything_that_is_given_is_in_the_ord
     assert not np.array_equal(whole.vertex[:VERTICES], np.arange(VERTICES))
     same((whole.position, whole.frame), (seen.position, seen.frame))
     assert isinstance(whole, separable.system.Transport)
-
-
-def test_numbering_the_vertices_anew_numbers_the_radiance(whole, mesh, brdf, random, close):
-    light = builtin.daylight(size=SIZE)
-    order = random.permutation(VERTICES)
-    number = np.argsort(order)
-    shuffled = jax.tree.map(lambda each: each[order] if len(each) == VERTICES else each, mesh)
-    shuffled = eqx.tree_at(lambda m: m.face, shuffled, jnp.asarray(number[np.asarray(mesh.face)], jnp.int32))
-    again = precompute(visibility.precompute(shuffled, size=SIZE), brdf, **WHOLE)
-    expected = relight(whole, brdf, light)[order]
-    close(relight(again, brdf, light), expected, tolerance=2 * HALF)
 
 
 def test_clusters_join_what_lies_and_faces_alike(random):

@@ -34,12 +34,6 @@ def test_lambert_needs_one_term():
     assert separable.factor(Lambert(0.5), error=0.01, resolution=16).terms == 1
 
 
-def test_light_maps_are_gray_and_color_is_in_the_view_maps():
-    factored = separable.factor(AshikhminShirley(diffuse=[0.9, 0.2, 0.1], specular=0.3), terms=3, resolution=16)
-    assert factored.light_map.shape == (3, 16, 16, 1)
-    assert factored.view_map.shape == (3, 16, 16, 3)
-
-
 def test_gray_brdfs_of_any_number_are_factored_together():
     both = Channels((Lambert(0.4), CookTorrance(roughness=0.5)), jnp.ones(2))
     factored = separable.factor(both, terms=52, resolution=8)

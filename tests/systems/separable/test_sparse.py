@@ -46,11 +46,6 @@ def test_the_largest_are_kept_in_falling_order(random, colors):
     np.testing.assert_allclose(dense(transport), expected, rtol=1e-6)
 
 
-def test_all_coefficients_are_the_rows_themselves(random):
-    coefficient = random.normal(size=(3, 24, 2, 3))
-    np.testing.assert_allclose(dense(make(coefficient, 24)), coefficient, rtol=1e-6)
-
-
 def test_rows_with_few_coefficients_are_padded_with_index_zero_and_value_zero():
     coefficient = np.zeros((2, 24, 2, 1))
     coefficient[0, 5, 0], coefficient[1, 23, 1] = 3, -2
@@ -126,7 +121,7 @@ def test_rms_is_that_of_the_dense_rows(random, close, colors):
     assert np.all(np.asarray(make(np.zeros((2, 24, 1, 1)), 3).rms) == 0)
 
 
-@pytest.fixture(params=[(1, 1), (1, 3), (3, 3), (3, 1)], ids=lambda p: f"transport {p[0]}, light {p[1]}")
+@pytest.fixture(params=[(1, 3), (3, 3), (3, 1)], ids=lambda p: f"transport {p[0]}, light {p[1]}")
 def prepared(request, random):
     """Transport of 40 vertices with and without its transpose, and a light."""
     colors, light_colors = request.param
