@@ -229,7 +229,6 @@ def test_a_port_that_is_taken_is_refused_before_anything_is_computed(monkeypatch
 @pytest.mark.parametrize(
     ("argument", "words"),
     [
-        (["--lobes", "0"], "'--lobes': must be a whole number from 1 to 64, got 0"),
         (["--port", "70000"], "'--port': must be a whole number from 0 to 65535, got 70000"),
         (["--ground"], "--ground needs a mesh"),
         (["nothing.obj"], "nothing.obj"),

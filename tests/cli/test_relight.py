@@ -7,7 +7,6 @@ import re
 import shutil
 import subprocess
 import sys
-import warnings
 
 import numpy as np
 import OpenImageIO
@@ -182,19 +181,6 @@ def test_the_pictures_differ_by_what_the_report_says(output):
     np.testing.assert_allclose(np.abs(image - reference), difference, atol=2e-3 * reference.max())
 
 
-def test_a_second_run_takes_the_transport_from_the_first(place, output, capsys):
-    before = report(output)
-    stored = {path: path.stat().st_mtime_ns for path in output.glob("*/*.prt/**/*") if path.is_file()}
-    assert run(place, *WHOLE, sky=("sky.exr", "dusk.exr"), output=output) == 0
-    told = capsys.readouterr()
-    assert "pictures and report.json are in" in told.out
-    assert "error" not in told.err.lower()
-    assert stored == {path: path.stat().st_mtime_ns for path in stored}
-    for system in SYSTEMS:
-        errors = (found["lights"]["sky"][system]["picture_error"] for found in (before, report(output)))
-        assert len(set(errors)) == 1
-
-
 @pytest.fixture(scope="module")
 def glossy(place):
     """What a run of a glossy BRDF leaves, with the error table, under two skies of one name."""
@@ -278,9 +264,7 @@ def test_bad_files_are_named_on_stderr_with_status_2(place, tmp_path, capsys, op
             "--modes needs --system clusters or dynamic, got lobe,harmonic",
         ),
         (["--brdf", "ashikhmin-shirley", "--terms", "3000"], "terms must be between 1 and .* got 3000"),
-        (["--brdf", "velvet"], "must be one of lambert, phong, .* got 'velvet'"),
         (["--brdf", "ward:along=nan"], "along of ward must be a finite number, got 'nan'"),
-        (["--brdf", "lambert:albedo=.1/.2"], "albedo of lambert must be numbers, or colors as .1/.2/.3, got '.1/.2'"),
         (["--brdf", "merl:absent.binary"], "absent.binary must be a BRDF in MERL's format, and there is no such file"),
         (["--order", "16"], "'--order': must be a whole number from 1 to 15, got 16"),
         (["--lobes", "0"], "'--lobes': must be a whole number from 1 to 64, got 0"),
@@ -378,30 +362,11 @@ def stop(*_, **__):
     raise KeyboardInterrupt
 
 
-def test_an_interrupt_ends_in_one_line_and_status_130(place, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(prt.separable, "factor", stop)
-    assert run(place, output=tmp_path) == 130
-    assert capsys.readouterr().err == "jaxprt: stopped; the same command goes on from here\n"
-
-
 def test_two_skies_of_one_name_are_both_relit(place, glossy):
     paths = (str(place / "sky.exr"), str(place / "glossy" / "other" / "sky.exr"))
     assert report(glossy)["environments"] == dict(zip(("sky", "sky_2"), paths, strict=True))
     first, second = (prt.files.read_image(glossy / f"{name}_separable.exr")[0] for name in ("sky", "sky_2"))
     assert np.abs(first - second).max() > 0.1
-
-
-@pytest.mark.parametrize(("mesh", "count"), [("mesh.obj", 0), ("inside_out.obj", 1)])
-def test_only_an_inside_out_mesh_is_warned_of(place, tmp_path, monkeypatch, capsys, mesh, count):
-    swapped = re.sub(r"^f (\d) (\d) (\d)$", r"f \1 \3 \2", OBJ, flags=re.MULTILINE)
-    (place / "inside_out.obj").write_text(swapped)
-    monkeypatch.setattr(prt.separable, "factor", stop)
-    with warnings.catch_warnings():
-        warnings.simplefilter("default")
-        assert run(place, "--system", "separable", mesh=mesh, output=tmp_path) == 130
-    warned = [line for line in capsys.readouterr().err.splitlines() if line.startswith("Warning: ")]
-    assert len(warned) == count
-    assert not count or re.search(r"sees 100% of part .* from behind, and backs are black: .* inside out", warned[0])
 
 
 def test_the_module_runs_as_a_program():

@@ -125,18 +125,6 @@ def test_coverage_at_upright_and_level_edges_is_within_an_eighth(turns):
     assert max(off) > MOST_OFF_UPRIGHT / 2
 
 
-def test_coverage_is_that_of_a_picture_eight_times_as_fine():
-    camera, mesh = _camera(eye=(0.7, 1.1, 2.4)), _ball()
-    fine = np.asarray(raster.rasterize(mesh, _finer(camera, 8)).triangle) >= 0
-    fine = fine.reshape(camera.height, 8, camera.width, 8).mean((1, 3))
-    coverage = _coverage(_drawn(mesh, camera)[1], camera)
-    cut = (fine > 0) & (fine < 1)
-    assert cut.sum() > 30
-    assert np.abs(coverage - fine).max() < MOST_OFF + 0.02
-    assert np.sqrt(np.mean((coverage - fine)[cut] ** 2)) < 0.13
-    assert abs(np.sum(coverage - fine)) < 0.004 * fine.sum()
-
-
 def test_samples_are_centers_of_a_picture_four_times_as_fine():
     camera = _camera(eye=(0.5, 0.9, 2.6), target=(0.1, 0, 0.1))
     mesh = join([_ball(), _mesh(*_soup(0, 200))])
@@ -317,12 +305,11 @@ def test_what_is_seen_from_behind_is_black_and_hides_the_background():
     np.testing.assert_array_equal(picture[..., 0], 1 - hidden)
 
 
-@pytest.mark.parametrize("shape", [(10, 20), (20, 40)])
 @pytest.mark.parametrize("eye", [(0.6, 0.3, 3.3), None])
-def test_a_white_sphere_of_few_triangles_has_no_black_rim(shape, eye):
-    mesh = _sphere(*shape)
+def test_a_white_sphere_of_few_triangles_has_no_black_rim(eye):
+    mesh = _sphere(10, 20)
     # Just outside of one triangle, below the horizons of all vertices.
-    eye = 1.002 * np.mean(mesh.position[mesh.face[sum(shape) * 5]], 0) if eye is None else eye
+    eye = 1.002 * np.mean(mesh.position[mesh.face[150]], 0) if eye is None else eye
     camera = _camera(eye=eye)
     fragments = raster.rasterize(mesh, camera, samples=4)
     picture = pixels.render(mesh, jnp.ones((len(mesh.position), 1)), camera)

@@ -74,21 +74,6 @@ def test_lamps_add_to_the_light_around(close):
     close(np.asarray(batch), np.stack([whole, dark]))
 
 
-def test_pictures_have_the_light_of_lamps(close):
-    """At one sample a pixel the floor is what its points have, in a new picture and in a kept view."""
-    picture = np.asarray(relit().picture(DARK, samples=1))
-    kept = np.asarray(relit().picture_view(samples=1).picture(DARK))
-    close(picture, kept)
-    vertices = prt.image.render(relit().mesh, relit().radiance(DARK, eye=EYE), CAMERA, samples=1)
-    shown = picture.sum(-1) > 0
-    off = (picture - np.asarray(vertices))[shown]
-    assert shown.mean() > 0.2
-    assert np.linalg.norm(off) < 0.1 * np.linalg.norm(picture)
-    dim = {"bulb": PointLight("bulb", BULB.position, 0.25)}
-    lamp = relit().picture(DARK, samples=1, materials=dim)
-    assert np.linalg.norm(np.asarray(lamp) - picture) > 0.05 * np.linalg.norm(picture)
-
-
 def test_layers_by_light_are_pictures_of_their_light_alone_and_add_up(close):
     around = Environment(jnp.asarray(np.random.default_rng(0).uniform(size=(6, 8, 8, 3)).astype(np.float32)))
     right = (np.asarray(cubemap.direction(size=8))[..., 0] > 0).astype(np.float32)

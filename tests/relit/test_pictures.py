@@ -16,7 +16,7 @@ import jaxprt as prt
 from jaxprt import bounces, lobe, visibility
 from jaxprt.brdf import CookTorrance, Lambert
 from jaxprt.image import rasterize
-from jaxprt.relit import Harmonics, Lobes, RelitScene, Terms, canvas, channels, probes, shadows, tracing
+from jaxprt.relit import Harmonics, Lobes, RelitScene, canvas, channels, probes, shadows, tracing
 from jaxprt.relit.exact import exact_picture, exact_pixels
 from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.material import Texture
@@ -44,9 +44,9 @@ def image(edge: int = 8) -> np.ndarray:
     return np.random.default_rng(0).uniform(0.1, 0.9, (edge, edge, 3)).astype(np.float32)
 
 
-def matte(**more) -> TexturedMaterial:
+def matte() -> TexturedMaterial:
     """What reflects diffusely alone, with a texture of color."""
-    return TexturedMaterial(metallic=0.0, specular=0.0, base_color_texture=Texture(image()), **more)
+    return TexturedMaterial(metallic=0.0, specular=0.0, base_color_texture=Texture(image()))
 
 
 def scene(*, floor=None, ball=SHARP) -> Scene:
@@ -67,10 +67,9 @@ def relit(system=None, bounces: int = 0) -> RelitScene:
     return prt.precompute(scene(), refine=False, system=system, size=SIZE, bounces=bounces, progress=False)
 
 
-@pytest.mark.parametrize("system", [Lobes(4, 8), Harmonics(degree=3), Terms(terms=4, keep=384, resolution=16)], ids=str)
-def test_a_white_scene_in_a_white_light_is_white_to_its_edges(system):
+def test_a_white_scene_in_a_white_light_is_white_to_its_edges():
     white = scene(floor=Lambert(1.0), ball=Lambert(1.0))
-    ready = prt.precompute(Scene([white["ball"]]), refine=False, system=system, size=SIZE, progress=False)
+    ready = prt.precompute(Scene([white["ball"]]), refine=False, system=Lobes(4, 8), size=SIZE, progress=False)
     picture = np.asarray(ready.picture(Environment(jnp.ones((6, SIZE, SIZE, 3))), CAMERA))
     np.testing.assert_allclose(picture, 1, atol=0.03)
 
@@ -128,32 +127,6 @@ def test_more_samples_are_nearer_to_a_picture_of_eight_times_the_size():
     assert 2 * sixteen < 1.2 * four < one
     with pytest.raises(ValueError, match="samples must be 1, 4 or 16, got 9"):
         ready.picture_view(CAMERA, samples=9)
-
-
-@pytest.mark.parametrize("bounced", [0, 1])
-def test_a_kept_view_gives_the_picture_of_every_light(bounced, close):
-    ready = relit(bounces=bounced)
-    view = ready.picture_view(CAMERA)
-    for seed in (1, 2):
-        close(view.picture(light(seed)), ready.picture(light(seed), CAMERA), tolerance=1e-5)
-    assert {row.number for row in view.rows} == {0, 1}
-
-
-def test_bounces_are_in_the_picture():
-    color = relit(bounces=1).picture(light(), CAMERA) - relit().picture(light(), CAMERA)
-    assert float(jnp.min(color)) > -1e-5
-    assert 0.01 < float(jnp.max(color)) < 0.3
-
-
-def test_pictures_have_other_materials(close):
-    ready = relit()
-    half = {"floor": matte(base_color=0.5)}
-    color = ready.picture(light(), CAMERA, materials=half)
-    shown = np.asarray(rasterize(ready.mesh, CAMERA, samples=4).triangle)
-    floor = np.all((shown >= 0) & (shown < 2), -1)
-    close(np.asarray(color)[floor], 0.5 * np.asarray(ready.picture(light(), CAMERA))[floor], tolerance=1e-5)
-    same = ready.picture(light(), CAMERA, materials=ready.appearances({"floor": matte()}))
-    assert np.isfinite(same).all()
 
 
 def test_pictures_go_through_programs_and_have_gradients(close):

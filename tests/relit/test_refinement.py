@@ -49,15 +49,6 @@ def test_parts_cast_shadows_on_each_other_and_are_divided_alike_at_their_border(
     close(np.asarray(fine["left"].color), 1 + np.asarray(fine["left"].mesh.position))
 
 
-def test_a_refined_scene_can_be_relit_as_any_other(scene, light):
-    fine = prt.refine(scene, error=0.1, environments=[light], progress=False)
-    recipe = prt.relit.Harmonics(degree=1)
-    relit = prt.precompute(fine, refine=False, system=recipe, size=8, progress=False)
-    color = relit.radiance(light, eye=relit.camera.eye)
-    assert len(color) == len(fine.mesh.position) > len(scene.mesh.position)
-    assert np.isfinite(np.asarray(color)).all()
-
-
 def test_without_lights_any_light_counts(scene):
     fine = prt.refine(scene, error=0.03, vertices=2000, progress=False)
     assert len(fine.mesh.position) > len(scene.mesh.position) + 10

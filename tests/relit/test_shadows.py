@@ -1,7 +1,5 @@
 """Shadows of bright texels by rays from the points of pictures, beside closed forms."""
 
-import dataclasses
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -105,8 +103,3 @@ def test_other_words_are_refused(relit):
         relit.picture(sunny(), shadows="soft")
     with pytest.raises(TypeError, match='shadows must be "rays" or "vertices"'):
         relit.picture(sunny(), shadows=sunny())
-
-
-def test_the_size_of_a_picture_and_nan_free_edges(relit):
-    wide = dataclasses.replace(CAMERA, width=33, height=17)
-    assert np.isfinite(np.asarray(relit.picture(sunny(), wide))).all()

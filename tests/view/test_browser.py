@@ -349,7 +349,7 @@ def test_five_hundred_looks_of_two_browsers_end_right_and_leave_little_behind(br
     server.close()
 
 
-@pytest.mark.parametrize(("factor", "stops"), [(1.0, 0.0), (2.0**8, -8.0), (2.0**-8, 8.0)])
+@pytest.mark.parametrize(("factor", "stops"), [(2.0**8, -8.0), (2.0**-8, 8.0)])
 def test_what_is_seen_first_is_neither_white_nor_black(browser, systems, lights, factor, stops):
     light = Environment(factor * np.asarray(lights["gray"].radiance))
     server = Server(Session(systems, environments={"gray": light}))

@@ -210,9 +210,8 @@ def strip(hand):
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(text.partition(",")[2]))).convert("RGB")).astype(float)
 
 
-@pytest.mark.parametrize("degrees", [0.0, 90.0, -135.0])
-def test_a_sun_lands_where_the_mouse_is_in_the_turned_light(hand, degrees):
-    typed(hand, "rotation °", str(degrees))
+def test_a_sun_lands_where_the_mouse_is_in_the_turned_light(hand):
+    typed(hand, "rotation °", "-135")
     hand.page.wait_for_timeout(500)
     before = strip(hand)
     box = hand.page.locator("canvas.sky").bounding_box()
@@ -221,7 +220,7 @@ def test_a_sun_lands_where_the_mouse_is_in_the_turned_light(hand, degrees):
     hand.page.mouse.click(box["x"] + u * box["width"], box["y"] + v * box["height"])
     hand.settle()
     (lamp,) = hand.state()["lamps"]
-    turned = np.asarray(stages.about(np.radians(degrees))) @ lamp["direction"]
+    turned = np.asarray(stages.about(np.radians(-135))) @ lamp["direction"]
     lon, lat = np.pi * (1 - 2 * u), np.pi * (0.5 - v)
     there = np.array([np.cos(lat) * np.sin(lon), np.sin(lat), np.cos(lat) * np.cos(lon)])
     assert np.dot(turned, there) > np.cos(0.02)

@@ -291,8 +291,7 @@ def test_viewer_of_the_page_draws_and_follows_hands(browser, made):
     tab.close()
 
 
-@pytest.mark.parametrize("recipe", [prt.relit.Lobes(8, texels=2), prt.relit.Harmonics(2)])
-def test_parts_with_one_kind_of_material_share_a_table(recipe):
+def test_parts_with_one_kind_of_material_share_a_table():
     plane = builtin.plane(cells=1)
     matte = TexturedMaterial(metallic=0.0, specular=0.0)
     rough = [TexturedMaterial(metallic=metallic, roughness=0.5 + 0.2 * metallic) for metallic in (0.0, 1.0)]
@@ -302,7 +301,7 @@ def test_parts_with_one_kind_of_material_share_a_table(recipe):
     ]
     pairs = zip(meshes, materials.items(), strict=True)
     scene = Scene([Part(name, mesh, material) for mesh, (name, material) in pairs])
-    made = prt.precompute(scene, refine=False, system=recipe, size=8, progress=False)
+    made = prt.precompute(scene, refine=False, system=prt.relit.Lobes(8, texels=2), size=8, progress=False)
     content, arrays = scene_content(PageScene.of(made).reduced(2, texels=False))
     first, shiny, second, matte = content["parts"]
     assert first["tableStart"] == second["tableStart"] == 0
@@ -402,10 +401,3 @@ def test_matte_scenes_have_their_bounces_and_lamps_in_pages(browser, lit, lights
     turned = np.asarray(lit.radiance(rotate(soft["soft"], stages.about(np.pi / 2)), eye=eye))
     assert off(page.color(look | {"turn": np.pi / 2}), turned) < LOW
     page.page.close()
-
-
-def test_environments_of_gray_are_lights_too(systems, tmp_path):
-    made = view.export(
-        systems["lobes"], tmp_path / "gray.html", environments={"gray": Environment(np.ones((6, 8, 8, 1)))}
-    )
-    assert made.error < 1
