@@ -229,7 +229,7 @@ def interrupts(folder: pathlib.Path, quick: bool) -> Iterator[dict[str, Any]]:
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGINT)
             stopped += 1
-        process.communicate(timeout=60)
+        process.communicate(timeout=600)  # the picture under way ends first
     subprocess.run([*command, "--output", str(folder / "part")], check=True, capture_output=True)
     whole, part = (sorted((folder / name / "ball").glob("*.png")) for name in ("set", "part"))
     same = [one.read_bytes() == other.read_bytes() for one, other in zip(whole, part, strict=True)]
