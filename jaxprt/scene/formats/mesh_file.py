@@ -6,7 +6,7 @@ import re
 import numpy as np
 
 from jaxprt.files import inputs
-from jaxprt.scene.formats import file_parts, geometry, gltf_file, gltf_geometry, obj, ply, text
+from jaxprt.scene.formats import geometry, gltf_file, gltf_geometry, obj, ply, text
 from jaxprt.scene.formats.geometry import Geometry, MeshContent, Polygons
 
 # Texture coordinates, colors, normals, a fourth coordinate, and another dimension.
@@ -172,10 +172,7 @@ def read(path: pathlib.Path, *, groups: bool) -> Geometry:
     if path.suffix.lower() in (".glb", ".gltf"):
         with gltf_file.name_file_in_errors(path):
             return gltf_geometry.read(gltf_file.Document(path), groups=groups).geometry
-    mesh = content(path, groups=groups)
-    if path.suffix.lower() == ".obj":  # of other formats, colors and images alone are ignored
-        file_parts.warn_of_ignored(path, mesh.ignored, stacklevel=3)
-    return mesh.geometry._replace(color=None)
+    return content(path, groups=groups).geometry._replace(color=None)
 
 
 _READERS = {".ply": ply.read, ".stl": read_stl, ".off": read_off}
