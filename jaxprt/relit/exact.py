@@ -29,6 +29,7 @@ from jaxprt.scene.points import Points, on_triangles
 from jaxprt.scene.scene import centered
 from jaxprt.systems import reference
 from jaxprt.visibility import Occluder, blocks
+from jaxprt.visibility.rays import BLOCK
 
 _SIDE = 4  # number of coverage places along the edge of a pixel
 _PER_PIXEL = 64  # points of a picture for each pixel at which its error is estimated
@@ -274,10 +275,12 @@ def _sum(
         return np.asarray(reference.radiance(mesh, model, lights, points=some, progress=shown, **options))
 
     count = len(points)
-    parts = np.array_split(np.arange(count), min(blocks.cores(), max(count // 64, 1)))
+    cores = min(blocks.cores(), max(count // BLOCK, 1))
+    length = BLOCK * -(-count // (BLOCK * cores))  # whole blocks: fewer programs for the same rays
+    parts = np.resize(np.arange(count), (cores, length))
     # The threads of NumPy's matrix products would busy-wait.
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(len(parts)) as pool:
-        return np.concatenate(list(pool.map(radiance, range(len(parts)), parts)), 1)
+        return np.concatenate(list(pool.map(radiance, range(len(parts)), parts)), 1)[:, :count]
 
 
 class _PicturePoints(NamedTuple):

@@ -18,9 +18,8 @@ from jaxprt.scene.mesh import Mesh, relative
 from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.systems import adaptive, protocol
-from jaxprt.visibility.rays import PRECOMPUTE
+from jaxprt.visibility.rays import BLOCK, PRECOMPUTE
 
-_BLOCK = 64
 _MIRROR = np.array([-1, -1, 1], np.float32)
 _DARK = 1e-30
 
@@ -107,8 +106,8 @@ def radiance(
     matte = (
         getattr(brdf.model if isinstance(brdf, PerVertex) else brdf, "matte", False) and known(light) and error < np.inf
     )
-    for first in tqdm.trange(0, len(vertex), _BLOCK, desc="reference", disable=not progress):
-        part = np.resize(vertex[first : first + _BLOCK], _BLOCK)
+    for first in tqdm.trange(0, len(vertex), BLOCK, desc="reference", disable=not progress):
+        part = np.resize(vertex[first : first + BLOCK], BLOCK)
         fine = _shares(light, frame[part, 2]) > error / 4 if matte else True
         options = {"size": size, "supersample": fine}
         seen, _ = visibility.fractional(rays, start[part], np.asarray(above[part], np.float32), **options)
