@@ -268,8 +268,11 @@ def _text(summary: dict[str, Any], path: Path) -> str:
     exact, rows = summary["exact"], []
     for name, light in summary["lights"].items():
         least = light["exact_pixels_error"]
-        rows.append(f"{name}: errors of pictures are measured by {exact['pixels']} exact pixels, {least:.1%} off")
-        rows.append(f"{name}: the exact picture, shown beside the others, is {light['exact_picture_error']:.1%} off")
+        rows.append(f"{name}: errors of pictures are measured by {exact['pixels']} exact pixels, good to {least:.1%}")
+        least = light["exact_picture_error"]
+        rows.append(
+            f"{name}: the exact picture beside the others, a point for each surface of a pixel, good to {least:.1%}"
+        )
         for system in summary["times"]:
             parts = ", ".join(f"{part} {error:.1%}" for part, error in light[system]["vertex_error"].items())
             error, spread = (100 * light[system][key] for key in ("picture_error", "picture_error_spread"))

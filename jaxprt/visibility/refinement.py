@@ -212,7 +212,7 @@ def divisions(
             surface.divide(result[-1])
     if error > 0:
         warnings.warn(
-            f"{count} vertices leave an error of {100 * left:.2g} % by interpolation, above the {100 * error:.2g} % "
+            f"{count} vertices leave an error of {100 * left:.4g} % by interpolation, above the {100 * error:.2g} % "
             f"asked for; at most {vertices} were allowed",
             stacklevel=3,
         )
