@@ -181,6 +181,19 @@ def test_the_pictures_differ_by_what_the_report_says(output):
     np.testing.assert_allclose(np.abs(image - reference), difference, atol=2e-3 * reference.max())
 
 
+def test_a_second_run_takes_the_transport_from_the_first(place, output, capsys):
+    before = report(output)
+    stored = {path: path.stat().st_mtime_ns for path in output.glob("*/*.prt/**/*") if path.is_file()}
+    assert run(place, *WHOLE, sky=("sky.exr", "dusk.exr"), output=output) == 0
+    told = capsys.readouterr()
+    assert "pictures and report.json are in" in told.out
+    assert "error" not in told.err.lower()
+    assert stored == {path: path.stat().st_mtime_ns for path in stored}
+    for system in SYSTEMS:
+        errors = (found["lights"]["sky"][system]["picture_error"] for found in (before, report(output)))
+        assert len(set(errors)) == 1
+
+
 @pytest.fixture(scope="module")
 def glossy(place):
     """What a run of a glossy BRDF leaves, with the error table, under two skies of one name."""

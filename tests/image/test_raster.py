@@ -319,15 +319,16 @@ def test_colors_of_whole_numbers_are_drawn(unchecked):
 
 
 # The last test here: it forgets all programs, twice.
-def test_gpus_draw_what_cpus_draw(elsewhere, monkeypatch):
+@pytest.mark.parametrize("samples", [1, 4])
+def test_gpus_draw_what_cpus_draw(elsewhere, monkeypatch, samples):
     position, face = _soup(6, 12, reach=1.5)
     face = np.concatenate([face, face[:6], [[0, 0, 1]]])  # Of equal triangles the first is seen; some have no area.
     mesh, camera = _mesh(position, face), _camera()
-    wide = raster.rasterize(mesh, camera, samples=4)
+    wide = raster.rasterize(mesh, camera, samples=samples)
     monkeypatch.setattr(raster, "WIDE", 64)  # Several steps, some within a triangle.
-    steps = raster.rasterize.__wrapped__(mesh, camera, samples=4)
+    steps = raster.rasterize.__wrapped__(mesh, camera, samples=samples)
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *arguments, cpu, **forms: cpu(*arguments))
-    narrow = raster.rasterize.__wrapped__(mesh, camera, samples=4)
+    narrow = raster.rasterize.__wrapped__(mesh, camera, samples=samples)
     assert 0 < np.mean(np.asarray(narrow.triangle) >= 0) < 1
     for other in (wide, steps):
         np.testing.assert_array_equal(other.triangle, narrow.triangle)

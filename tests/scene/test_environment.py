@@ -376,13 +376,14 @@ def test_rotating_by_the_identity_changes_nothing():
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_quarter_turns_permute_the_texels(axis):
-    light = random_light(16)
+@pytest.mark.parametrize("size", [5, 16])
+def test_quarter_turns_permute_the_texels(axis, size):
+    light = random_light(size)
     vector = np.zeros(3)
     vector[axis] = np.pi / 2
     turned = environment.rotate(light, jnp.asarray(turn(vector), jnp.float32))
     # The texel seen at R s is the one that was at s.
-    destination = cubemap.point(size=16) @ jnp.asarray(np.round(turn(vector)), jnp.float32).T
+    destination = cubemap.point(size=size) @ jnp.asarray(np.round(turn(vector)), jnp.float32).T
     found = cubemap.lookup(turned.radiance, destination, sharpness=100)
     # Relative to the brightest texel: rounding lets a trace of the neighbors in.
     np.testing.assert_allclose(found, light.radiance, atol=1e-5 * float(light.radiance.max()))

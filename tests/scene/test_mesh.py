@@ -55,6 +55,9 @@ FILES = {
 }
 
 
+CLOSED = ["meshes/dragon_100k.ply", "meshes/rocker_arm.ply", "meshes/cow.obj", "meshes/spot.obj"]
+
+
 def write(folder, name, content):
     path = folder / name
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -525,6 +528,15 @@ def test_every_file_of_the_data_is_in_the_table(data):
 def test_a_file_without_geometry_is_refused(data):
     with pytest.raises(ValueError, match=r"empty\.obj must hold vertices and faces, got no faces"):
         load_mesh(data / "meshes_awkward/empty.obj")
+
+
+@pytest.mark.parametrize("name", CLOSED)
+def test_normals_of_closed_surfaces_agree_with_their_faces(data, name):
+    mesh = load_mesh(data / name)
+    surface = trimesh.Trimesh(mesh.position, mesh.face, process=False)
+    assert surface.volume > 0
+    agreement = (surface.face_normals[:, None] * np.asarray(mesh.normal)[np.asarray(mesh.face)]).sum(2)
+    assert np.average(agreement.min(1) > 0, weights=surface.area_faces) > 0.995
 
 
 @pytest.mark.parametrize("name", ["meshes/stanford_bunny.ply", "meshes/cow.obj"])

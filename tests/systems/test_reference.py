@@ -11,12 +11,14 @@ from jaxprt import reference, visibility
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.scene import Environment
+from jaxprt.scene.environment import rotate
 from jaxprt.sphere import cubemap, directions
 
 SIZE = 8
 EYE = jnp.array([2.0, 3.0, 4.0])
 HORIZON = 1e-2  # Texels of 8 x 8 faces that the horizon cuts: measured .7 % at worst.
 GRADIENT = 1e-2  # Differences of sums in float32 over a step of a fortieth.
+TURNED = 1e-4  # Rays along rotated directions meet edges on either side by rounding.
 CENTERS = np.inf  # The error that leaves one point to each texel: sums are then equal, not close.
 GLOSSY = AshikhminShirley(diffuse=[0.6, 0.2, 0.1], specular=0.3, nu=20, nv=60)
 
@@ -106,6 +108,12 @@ def test_vertices_do_not_depend_on_who_else_is_asked_for(mesh, random, close, co
     close(reference.radiance(mesh, GLOSSY, light, eye=EYE, vertex=vertex), whole[vertex])
 
 
+def test_eyes_in_odd_places_give_finite_radiance(mesh, random):
+    for eye in (mesh.position[7], [0, 0, 0], [0.3, -0.2, 0.4], [1e15, 1e15, -1e15], mesh.position[7] * (1 + 1e-6)):
+        color = reference.radiance(mesh, GLOSSY, some_light(random), eye=jnp.asarray(eye, jnp.float32))
+        assert np.isfinite(color).all()
+
+
 def test_gray_brdfs_and_gray_lights_give_what_their_colors_would(random, close):
     arrays, light = hemisphere(random), some_light(random)
     close(
@@ -138,6 +146,20 @@ def test_texels_that_matter_less_than_the_error_have_one_ray_where_the_surface_i
     assert no_count == 0 < coarse_count < 0.8 * fine_count
     assert 0 < np.linalg.norm(coarse - fine) < 0.02 * np.linalg.norm(fine)
     assert np.linalg.norm(coarse - fine) < np.linalg.norm(none - fine)
+
+
+@pytest.mark.parametrize("brdf", [Lambert(0.5), GLOSSY], ids=["lambert", "glossy"])
+def test_a_quarter_turn_of_everything_changes_nothing(mesh, brdf, random, close):
+    light = some_light(random)
+    turn = jnp.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    fields = (mesh.position, mesh.normal, mesh.tangent)
+    turned = eqx.tree_at(lambda m: (m.position, m.normal, m.tangent), mesh, tuple(each @ turn.T for each in fields))
+    vertex = np.arange(0, 121, 2)
+    close(
+        reference.radiance(turned, brdf, rotate(light, turn), eye=turn @ EYE, vertex=vertex, error=CENTERS),
+        reference.radiance(mesh, brdf, light, eye=EYE, vertex=vertex, error=CENTERS),
+        tolerance=TURNED,
+    )
 
 
 def test_any_function_of_two_directions_is_a_brdf(mesh, random, close):

@@ -164,6 +164,14 @@ def test_a_new_light_eye_or_material_compiles_no_program_again(session, look, ki
     assert not compiled
 
 
+def test_pictures_at_rest_are_those_of_the_scene(session, systems, lights, look):
+    scene = systems["lobes"]
+    reply = session.answer(look | {"kind": "still", "width": 48, "height": 32})
+    camera = Camera(EYE, [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], 0.7, 48, 32)
+    expected = scene.without_bounces().picture(lights["lamp"], camera)
+    near(halves(reply).reshape(32, 48, 3), expected)
+
+
 def test_the_exact_picture_comes_with_the_error_of_the_other(session, look):
     reply = session.answer(look | {"kind": "exact", "width": 24, "height": 24})
     assert reply.content["exact"]

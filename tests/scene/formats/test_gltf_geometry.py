@@ -464,6 +464,13 @@ def test_a_real_fox_has_the_vertices_of_its_pose(data):
     np.testing.assert_allclose(np.asarray(mesh.position)[np.asarray(mesh.face).ravel()], expected, atol=1e-4)
 
 
+def test_a_simple_skin_stands_where_its_joints_are(data):
+    mesh = load_scene(data / "foreign/SimpleSkin.gltf").parts[0].mesh
+    # Both joints stand at (0, 1, 0) and were bound at (0.5, 1, 0).
+    assert np.min(mesh.position, 0).tolist() == [-0.5, 0, 0]
+    assert np.max(mesh.position, 0).tolist() == [0.5, 2, 0]
+
+
 def test_zeros_without_a_buffer_view_are_bounded_by_the_size_of_the_file(tmp_path):
     writer = one((writer := Writer()).square(), writer=writer)
     zero = writer.add("accessors", {"componentType": 5126, "count": 4, "type": "VEC3"})

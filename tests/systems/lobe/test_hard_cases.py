@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxprt as prt
-from jaxprt import bright_texels, lobe
+from jaxprt import bright_texels, lobe, reference
 from jaxprt.brdf import AshikhminShirley, BlinnPhong, CookTorrance
 from jaxprt.scene import Environment
 from jaxprt.sphere import cubemap, hemisphere
@@ -211,3 +211,31 @@ def test_light_of_one_texel_is_finite_and_bounded_by_the_flux(tables, transport,
     texel, _, rest = bright_texels.split(light, count=1)
     assert texel == place
     np.testing.assert_array_equal(rest.radiance, 0)
+
+
+def test_the_texel_apart_is_exact_also_where_light_and_view_are_one_direction(seen, transport):
+    """wi = wo, at the normal, at 45 degrees and near the horizon: stored bits against the sum over all texels."""
+    center = np.asarray(cubemap.direction(size=SIZE)).reshape(-1, 3)
+    for wanted in ([0, 0, 1], [1, 0, 1], [0.05, 1, 0.05]):
+        place = np.argmax(center @ np.asarray(wanted))
+        radiance = np.zeros((6 * SIZE * SIZE, 3), np.float32)
+        radiance[place] = 5
+        light = Environment(jnp.asarray(radiance.reshape(6, SIZE, SIZE, 3)))
+        eye = jnp.asarray(1e4 * center[place], jnp.float32)
+        texel, excess, _ = bright_texels.split(light, count=1)
+        for name in ("sharp", "rough", "power", "brushed"):
+            color = jax.jit(bright_texels.radiance)(transport, BRDF[name], texel, excess, eye=eye)
+            exact = reference.integrate(seen, transport.position, transport.frame, BRDF[name], light, eye, error=np.inf)
+            assert np.isfinite(color).all()
+            np.testing.assert_allclose(color, exact, rtol=1e-3, atol=1e-6)
+
+
+def test_gradients_stay_finite_where_nothing_is_seen_and_at_the_horizon(tables, transport):
+    light = Environment(jnp.ones((6, SIZE, SIZE, 1)))
+
+    @jax.jit
+    def slopes(eye, table):
+        return jax.grad(lambda *x: jnp.mean(relight(transport, x[1], light, eye=x[0])), (0, 1))(eye, table)
+
+    for eye in 1e3 * np.asarray(view(0.0, np.pi / 2)):
+        assert all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(slopes(eye, tables("rough"))))

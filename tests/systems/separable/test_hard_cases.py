@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxprt as prt
-from jaxprt import reference, separable
+from jaxprt import bright_texels, reference, separable
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.scene import Environment, builtin
 from jaxprt.scene.mesh import join, make_mesh
@@ -64,9 +64,9 @@ def relight(mesh, brdf, light, *, keep=24, eye=EYE, vertex=None):
     return color[:count]
 
 
-def exact_radiance(mesh, brdf, light, *, eye=EYE, vertex=None):
+def exact_radiance(mesh, brdf, light, *, eye=EYE, vertex=None, error=1e-5):
     count, vertex = repeated(mesh, vertex)
-    return np.asarray(reference.radiance(mesh, brdf, light, eye=eye, vertex=vertex, error=1e-5))[:count]
+    return np.asarray(reference.radiance(mesh, brdf, light, eye=eye, vertex=vertex, error=error))[:count]
 
 
 def known_error(mesh, color, light, *, albedo=(0.8, 0.5, 0.2), keep=24, eye=EYE, vertex=None):
@@ -75,6 +75,30 @@ def known_error(mesh, color, light, *, albedo=(0.8, 0.5, 0.2), keep=24, eye=EYE,
     error = np.abs(color - exact).max()
     assert (color >= -error - 1e-6).all()
     return error / max(np.abs(exact).max(), 1e-30)
+
+
+def sun(strength):
+    """Half of the light, or so, in one texel."""
+    radiance = jnp.ones((6, SIZE, SIZE, 3))
+    return Environment(radiance.at[2, 3, 4].set(strength))
+
+
+@pytest.mark.parametrize("strength", [384.0, 1e6, 1e30])
+def test_a_sun_in_one_texel_is_that_of_the_reference(lambert, strength):
+    mesh, light = sphere(), sun(strength)
+    color = relight(mesh, lambert, light, keep=ALL)
+    exact = exact_radiance(mesh, Lambert([0.8, 0.5, 0.2]), light)
+    np.testing.assert_allclose(color / strength, exact / strength, atol=1e-5)
+
+
+@pytest.mark.parametrize("exponents", [(1, 1), (1000, 1000), (10000, 10000), (0, 0), (1, 10000)])
+def test_dull_and_sharp_brdfs_give_finite_radiance(light, exponents):
+    brdf = AshikhminShirley(diffuse=0.3, specular=0.5, nu=exponents[0], nv=exponents[1])
+    color = relight(sphere(), factor(brdf, terms=4, resolution=12), light)
+    assert color.any()
+    exact = exact_radiance(sphere(), brdf, light, error=0.01)
+    assert np.isfinite(exact).all()
+    assert (exact >= 0).all()
 
 
 def test_all_coefficients_equal_the_reference_and_one_is_finite(lambert, light):
@@ -202,6 +226,19 @@ def test_vertices_that_see_nothing_are_black_and_the_others_as_they_were(seen, l
     close(color, expected, tolerance=HALF)
     if which != "one vertex":  # Alone in its cluster it is as black as half precision has it.
         assert not color[vertex].any()
+
+
+@pytest.mark.parametrize("strength", [384.0, 1e6])
+def test_a_sun_by_its_texel_and_the_rest_by_clusters_are_the_reference(seen, close, strength):
+    brdf, light = Lambert([0.8, 0.5, 0.2]), sun(strength)
+    texel, excess, rest = bright_texels.split(light, count=1)
+    assert np.asarray(rest.radiance).max() < 3
+    bright = np.asarray(bright_texels.radiance(seen, brdf, texel, excess, eye=EYE))
+    color = bright + clustered_radiance(seen, factor(brdf, terms=3, resolution=12), rest)
+    expected = all_texels(seen, brdf, light)
+    # What is compressed is off by half precision, the sun is not.
+    close(color, expected, tolerance=HALF * np.linalg.norm(expected - bright) / np.linalg.norm(expected) + 1e-5)
+    assert bright.any()
 
 
 AWKWARD = [
