@@ -28,9 +28,10 @@ from jaxprt import Blend, System, bounces, bright_texels, dynamic, harmonic, lob
 from jaxprt.brdf import CookTorrance
 from jaxprt.image import rasterize, resolve, shading_points
 from jaxprt.scene import Environment, Mesh
+from jaxprt.scene.points import VERTICES, Points
 from jaxprt.sphere import directions
 
-VERTICES = 36_000, 300_000, 1_000_000
+SIZES = 36_000, 300_000, 1_000_000
 MEMBERS = 225  # vertices of a cluster
 EYE = np.array([0.5, 1.0, 4.0], np.float32)
 
@@ -181,17 +182,13 @@ class OneGroup(System):
         """Harmonics of the light that arrives at the vertices."""
         return self.bounces.shade(light, [materials])[0]
 
-    def view(self, eye: jax.Array, materials: Any = None) -> Any:
+    def view(self, eye: jax.Array, materials: Any = None, points: Points = VERTICES) -> Any:
         """Harmonics of the BRDF."""
-        return self.bounces.group[0].view(eye, materials)
+        return self.bounces.group[0].view(eye, materials, points)
 
-    def combine(self, light: Any, view: Any) -> jax.Array:
+    def combine(self, light: Any, view: Any, points: Points = VERTICES) -> jax.Array:
         """Radiance of reflected light."""
-        return self.bounces.group[0].combine(light, view)
-
-    def at(self, points: Any) -> System:
-        """There are no points in benchmarks."""
-        raise NotImplementedError
+        return self.bounces.group[0].combine(light, view, points)
 
     @property
     def vertices(self) -> int:
@@ -212,7 +209,7 @@ SYSTEMS: dict[str, Callable[[Maker, int], tuple[System, Any]]] = {
 
 def main(options: Sequence[str] | None = None) -> None:
     parser = harness.parser(str(__doc__).splitlines()[0])
-    parser.add_argument("--vertices", type=int, nargs="+", default=VERTICES, metavar="N", help="sizes of the mesh")
+    parser.add_argument("--vertices", type=int, nargs="+", default=SIZES, metavar="N", help="sizes of the mesh")
     arguments = parser.parse_args(options)
     maker = Maker(size=8, picture=32) if arguments.quick else Maker(size=64, picture=512)
     for asked in [2 * MEMBERS] if arguments.quick else arguments.vertices:

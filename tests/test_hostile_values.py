@@ -141,7 +141,10 @@ def methods(relit: prt.RelitScene, name: str) -> dict[str, Verb]:
         ),
         f"{name}.picture_view": Verb(relit.picture_view, camera=camera(), materials=None, samples=1),
         f"{name}.with_rays": Verb(relit.with_rays, rays=8),
-        f"{name}.at": Verb(relit.at, points=[prt.scene.points.on_triangles(mesh().face, [0], [[0.2, 0.3, 0.5]])]),
+        f"{name}.points": Verb(
+            functools.partial(relit.view, jnp.asarray(EYE)),
+            points=[prt.scene.points.on_triangles(mesh().face, [0], [[0.2, 0.3, 0.5]])],
+        ),
         f"{name}.report": Verb(lambda environments: relit.report(environments), environments=[environment()]),
     }
 
@@ -322,7 +325,7 @@ def scene_verbs() -> dict[str, Verb]:
             eye=EYE,
             occluder=None,
             vertex=[0],
-            points=None,
+            points=prt.scene.points.VERTICES,
             error=1e-2,
             progress=False,
             between=None,

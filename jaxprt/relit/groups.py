@@ -15,15 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxprt import require
 from jaxprt.brdf import grid
 from jaxprt.compile import compile_time, jit, known, put, shared_size
 from jaxprt.relit import channels
 from jaxprt.relit.channels import Appearance, Shading
 from jaxprt.scene import Environment, Mesh, PointLight
 from jaxprt.scene import origin as origins
-from jaxprt.scene.material_table import MaterialLook, MaterialTable
+from jaxprt.scene.material_table import MaterialLook, MaterialTable, at_vertices
 from jaxprt.scene.mesh import frames, join
-from jaxprt.scene.points import Points
+from jaxprt.scene.points import VERTICES, Points
 from jaxprt.systems import protocol
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart
 from jaxprt.systems.lamps import LitByLamps
@@ -174,10 +175,32 @@ class Place(eqx.Module):
         pairs = zip(self.of_group(number, self.first), self.of_group(number, self.counts), strict=True)
         return np.concatenate([first + np.arange(count) for first, count in pairs])
 
-    def order(self) -> Int[np.ndarray, " v"]:
-        """Index of each vertex of the scene among the vertices of all groups."""
+    def order(self, points: Points | Sequence[Points] = VERTICES) -> Int[np.ndarray, " p"]:
+        """Index of each vertex of the scene, or of each point, among those of all groups."""
+        if not isinstance(points, Points):
+            counts = [len(of_part) for of_part in points]
+            size = [sum(self.of_group(number, counts)) for number in range(len(self.parts))]
+            return Place(tuple(counts), self.parts, tuple(size)).order()
         begin = np.cumsum([0, *self.size])[self.group] + self.start
         return np.concatenate([first + np.arange(n) for first, n in zip(begin, self.counts, strict=True)])
+
+    def points(self, number: int, points: Points | Sequence[Points]) -> tuple[Points, Points]:
+        """The vertices of a group, or the points on it, as points of the scene and of the group."""
+        if isinstance(points, Points):
+            vertex = self.column(number, [self.vertices(number)])
+            return at_vertices(vertex.astype(np.int32)), VERTICES
+        members = self.of_group(number, points)
+        xp = np if known(members) else jnp
+        in_scene, corner = (
+            [of_part.corner + row for of_part, row in zip(members, self.of_group(number, first), strict=True)]
+            for first in (self.first, self.start)
+        )
+        weight = xp.concatenate([of_part.weight for of_part in members], 1)
+        slopes: list[Any] = [of_part.slope for of_part in members]
+        slope = None if any(rows is None for rows in slopes) else xp.concatenate(slopes, 2)
+        corners = (xp.concatenate(rows, 1) for rows in (in_scene, corner))
+        scene, group = (Points(jnp.asarray(rows), jnp.asarray(weight), slope) for rows in corners)
+        return scene, group
 
     def column(self, number: int, rows: Sequence[Any]) -> Any:
         """One array of a group from those of its parts. Padding repeats the last row."""
@@ -324,6 +347,16 @@ class Stage(eqx.Module):
         look = look_at(self.table, self.rough, points)
         with compile_time(look, on_group, self.fixed[number], self.surfaces[number].scale):
             return material(self.surfaces[number], on_group, look, self.fixed[number])[0], on_group.tilted(look.normal)
+
+
+def check_points(points: Any, counts: Sequence[int]) -> None:
+    """Refuses anything but all vertices, or one list of points for each of the parts with some numbers of vertices."""
+    if isinstance(points, Points) and points.all_vertices:
+        return
+    if isinstance(points, Points) or not isinstance(points, Sequence) or len(points) != len(counts):
+        raise TypeError(f"the points must be a list, one for each of {len(counts)} parts, got {require.shown(points)}")
+    for of_part, count in zip(points, counts, strict=True):
+        protocol.check_points(of_part, count)
 
 
 def light(surfaces: Sequence[Surface], bounces: GroupBounces | None, environment: Environment) -> SceneLight:

@@ -152,9 +152,9 @@ class Sample:
 
     def _error(self, system: System, light: Environment, exact: np.ndarray) -> float:
         """Relative L2 error over all views, at points that face the viewer."""
-        lit, placed = system.light(light), system.at(self.points)
-        views = (placed.view(jnp.asarray(eye), self.blend) for eye in self.views)
-        now = np.stack([np.asarray(placed.combine(lit, view)) for view in views])
+        lit = system.light(light)
+        views = (system.view(jnp.asarray(eye), self.blend, self.points) for eye in self.views)
+        now = np.stack([np.asarray(system.combine(lit, view, self.points)) for view in views])
         return relative_error(np.broadcast_to(now, exact.shape)[self.facing], exact[self.facing])
 
     def _frame(self, system: System) -> float:

@@ -32,7 +32,7 @@ from jaxprt.scene import mesh as meshes
 from jaxprt.scene import origin as origins
 from jaxprt.scene import scene as scenes
 from jaxprt.scene.material_table import MaterialTable
-from jaxprt.scene.points import Points
+from jaxprt.scene.points import VERTICES, Points
 from jaxprt.systems import axes, protocol
 from jaxprt.systems.bounces import GroupBounces
 from jaxprt.systems.protocol import Blend, System
@@ -78,7 +78,6 @@ class RelitScene(System):
             Cameras, eyes and point lights are in the coordinates of the scene's file.
         curvature: How fast the radiance of each part varies with direction, from
             `jaxprt.relit.curvature.of_part`.
-        points: Points on each part at which radiance is computed; None for the vertices.
         samples: Number of sample points along the edge of each bright texel, for each part.
         sharp: Whether reflections of each part are traced.
         rays: Number of reflection rays that each vertex or point of a sharp part sends.
@@ -98,7 +97,6 @@ class RelitScene(System):
     table: MaterialTable
     camera: Camera
     curvature: Float[np.ndarray | Array, " n"]
-    points: tuple[Points, ...] | None
     samples: tuple[int, ...] = eqx.field(static=True)
     sharp: tuple[bool, ...] = eqx.field(static=True)
     rays: int = eqx.field(static=True)
@@ -144,7 +142,7 @@ class RelitScene(System):
         ]
         self.scene = dataclasses.replace(scene, parts=parts)
         self.shading, self.place, self.bounces, self.lamps = tuple(shading), place, bounces, lamps
-        self.mesh, self.points, self.rays = scene.mesh, None, rays
+        self.mesh, self.rays = scene.mesh, rays
         self.drawn = groups.padded(self.mesh)
         self.table = jax.device_put(material_table.of_parts(self.scene.parts))
         first = [channels.precomputed(part) for part in shading]
@@ -231,39 +229,51 @@ class RelitScene(System):
         return Arriving(direct, reflected, lamp)
 
     @promoted
-    def view(self, eye: Float[Array | np.ndarray, "3"], materials: Mapping[str, Any] | None = None) -> SceneView:
+    def view(
+        self,
+        eye: Float[Array | np.ndarray, "3"],
+        materials: Mapping[str, Any] | None = None,
+        points: Points | Sequence[Points] = VERTICES,
+    ) -> SceneView:
         """The factor of radiance that depends on the eye and the materials, for all groups.
 
+        Args:
+            eye: Position of the viewer.
+            materials: Dictionary from names of parts to new materials.
+            points: A list of the points on each part; by default the vertices. Materials are evaluated at the vertices,
+                and interpolated to points.
+
         Raises:
-            TypeError: `materials` is not a dictionary; a material is of a kind that its part does not take; or the
-                material of its part is a BRDF that cannot change.
-            ValueError: There is no part of the given name, or a material needs something that was not precomputed; see
-                `jaxprt.relit.channels.appearance`.
+            TypeError: `materials` is not a dictionary; a material is of a kind that its part does not take; the
+                material of its part is a BRDF that cannot change; or `points` is not one list of points for each part.
+            ValueError: There is no part of the given name; a material needs something that was not precomputed, see
+                `jaxprt.relit.channels.appearance`; or a point is not on a triangle of its part.
         """
+        groups.check_points(points, self.scene.counts)
         eye = require.position("the eye", origins.local("the eye", eye, self.mesh.origin))
         of_parts = scene_lamps.split(self.lamps, materials)[0]
         appearances = self.appearances(of_parts)
         stage, looks = self._stage(of_parts, appearances), self._gathered(appearances)
         views, starts = [], []
         for number, (surface, look) in enumerate(zip(stage.surfaces, looks, strict=True)):
-            points, place = self._points(number, stage)
-            blend = look.blend if place is None or look.blend is None else jax.tree.map(place.carry, look.blend)
+            in_scene, on_group = self._points(number, stage, points)
+            blend, emitted = jax.tree.map(on_group.carry, (look.blend, look.emitted))
             sharp = None
             if number in stage.sharp_groups:
-                sharp = stage.sharp_at(number, points)
-                assert sharp is not None
-                if self.points is None:
+                sharp = stage.sharp_at(number, in_scene)
+                if on_group.all_vertices:
                     with compile_time(self.mesh, eye):
-                        sharp = sharp * tracing.facing(self.mesh, eye)[points.corner[0]] * self._real(number)
-                starts.append(tracing.RayOrigins(number, points, place, blend, sharp, at_vertices=self.points is None))
-            emitted = look.emitted if place is None or look.emitted is None else place.carry(look.emitted)
-            views.append(Viewed(place, view_of(surface, eye, blend, place, sharp), emitted))
+                        sharp = sharp * tracing.facing(self.mesh, eye)[in_scene.corner[0]] * self._real(number)
+                starts.append(tracing.RayOrigins(number, in_scene, on_group, blend, sharp))
+            views.append(Viewed(on_group, view_of(surface, eye, blend, on_group, sharp), emitted))
         reflected = tracing.trace(stage, starts, eye, keep=True) if starts else None
         return SceneView(tuple(views), stage, reflected)
 
     @promoted
-    def combine(self, light: Arriving | SceneLight, view: SceneView) -> Float[Array, "v c"]:
-        """Radiance of all vertices, including emission."""
+    def combine(
+        self, light: Arriving | SceneLight, view: SceneView, points: Points | Sequence[Points] = VERTICES
+    ) -> Float[Array, "p c"]:
+        """Radiance of all vertices, or of the points of the view, including emission."""
         require.kind("the view", view, SceneView, source="RelitScene.view")
         if isinstance(light, SceneLight) and self.bounces is None and self.lamps is None:
             light = Arriving(light.direct, None, None)  # Materials do not change it.
@@ -275,60 +285,33 @@ class RelitScene(System):
             surface = groups.sampled(surface, max(self.place.of_group(number, view.stage.samples)))
             reflections = next(traced) if number in view.stage.sharp_groups else None
             colors.append(radiance(surface, light.at(number), viewed, reflections=reflections))
-        return groups.ordered(tuple(colors), self._order())
+        return groups.ordered(tuple(colors), self.place.order(points))
 
     @promoted
-    def under_lights(self, lights: Float[Array, "l 6 n n c"], view: SceneView, materials: Any = None) -> Array:
+    def under_lights(
+        self, lights: Float[Array, "l 6 n n c"], view: SceneView, materials: Any = None, points: Any = VERTICES
+    ) -> Float[Array, "l p _"]:
         """Radiance under several lights, by one program for each group: `System.under_lights`."""
         if view.reflected is not None:  # Rays hit other numbers of points from each eye.
             arriving = (protocol.arriving(self, Environment(light), materials) for light in lights)
-            return jnp.stack([self.combine(light, view) for light in arriving])
+            return jnp.stack([self.combine(light, view, points) for light in arriving])
         of_parts, changed = scene_lamps.split(self.lamps, materials)
         appearances = self.appearances(of_parts)
         blends = [look.blend for look in self._gathered(appearances)]
         lamp = None if self.lamps is None else self.lamps.radiance(self._all(appearances), changed)
-        return batches.radiance(self.surfaces, self.bounces, lights, blends, lamp, view, self._order())
+        return batches.radiance(self.surfaces, self.bounces, lights, blends, lamp, view, self.place.order(points))
 
-    def _points(self, number: int, stage: Stage) -> tuple[Points, Points | None]:
-        """The vertices of a group as points of the scene; or the scene's points on it, and these on the group."""
-        points, place = self._untilted(number)
+    def _points(self, number: int, stage: Stage, points: Points | Sequence[Points]) -> tuple[Points, Points]:
+        """Points, with the normals of normal maps, as points of the scene and of a group."""
+        in_scene, on_group = self.place.points(number, points)
         if stage.table.frame is None:
-            return points, place
-        # In scenes with normal maps, vertices are points on the group too, which have the normals of these maps.
-        if place is None:
-            place = material_table.at_vertices(np.arange(len(points), dtype=np.int32))
-        return points, place.tilted(groups.look_at(stage.table, stage.rough, points).normal)
-
-    def _untilted(self, number: int) -> tuple[Points, Points | None]:
-        """`_points` without normal maps."""
-        if self.points is None:
-            vertex = self.place.column(number, [self.place.vertices(number)])
-            return material_table.at_vertices(vertex.astype(np.int32)), None
-        placed = self.place.of_group(number, self.points)
-        xp, firsts = np if known(placed) else jnp, (self.place.first, self.place.start)
-        in_scene, corner = (
-            [points.corner + row for points, row in zip(placed, self.place.of_group(number, first), strict=True)]
-            for first in firsts
-        )
-        weight = xp.concatenate([points.weight for points in placed], 1)
-        slopes: list[Any] = [points.slope for points in placed]
-        slope = None if any(rows is None for rows in slopes) else xp.concatenate(slopes, 2)
-        corners = (xp.concatenate(rows, 1) for rows in (in_scene, corner))
-        scene, group = (Points(jnp.asarray(rows), jnp.asarray(weight), slope) for rows in corners)
-        return scene, group
+            return in_scene, on_group
+        return in_scene, on_group.tilted(groups.look_at(stage.table, stage.rough, in_scene).normal)
 
     def _real(self, number: int) -> Float[np.ndarray, " v"]:
         """1 at vertices of a group, 0 in padding."""
         count = sum(self.place.of_group(number, self.place.counts))
         return (np.arange(self.place.size[number]) < count).astype(self.mesh.position.dtype)
-
-    def _order(self) -> Any:
-        """Index of each vertex or point among those of all groups."""
-        if self.points is None:
-            return self.place.order()
-        counts = [len(points) for points in self.points]
-        size = [sum(self.place.of_group(number, counts)) for number in range(len(self.surfaces))]
-        return Place(tuple(counts), self.place.parts, tuple(size)).order()
 
     def _gathered(self, appearances: Mapping[str, Appearance]) -> list[Appearance]:
         """The appearance of each group: the precomputed one, or with other materials of some parts."""
@@ -427,11 +410,13 @@ class RelitScene(System):
         *,
         eye: Float[Array | np.ndarray, "3"],
         materials: Mapping[str, Any] | None = None,
-    ) -> Float[Array, "*l v c"]:
-        """Radiance that each vertex sends to the eye, including emission; see `jaxprt.radiance`."""
+        points: Points | Sequence[Points] = VERTICES,
+    ) -> Float[Array, "*l p c"]:
+        """Radiance that each vertex or point sends to the eye, including emission; see `jaxprt.radiance`."""
         environment = protocol.light_for(self, environment, batch=True)
         of_parts, changed = scene_lamps.split(self.lamps, materials)
-        return protocol.radiance(self, environment, eye=eye, materials={**self.appearances(of_parts), **changed})
+        looks = {**self.appearances(of_parts), **changed}
+        return protocol.radiance(self, environment, eye=eye, materials=looks, points=points)
 
     @property
     def origin(self) -> origins.Origin:
@@ -757,22 +742,10 @@ class RelitScene(System):
                 )
         return result
 
-    def at(self, points: Sequence[Points]) -> "RelitScene":
-        """The same scene at points on its parts instead of the vertices: one list of points for each part.
-
-        Materials are still evaluated at the vertices, and interpolated to the points.
-
-        Raises:
-            TypeError: `points` is not one list of points for each part.
-            ValueError: A point is not on a triangle of its part.
-        """
-        checked = protocol.check_points(points, self.scene.counts)
-        return eqx.tree_at(lambda relit: relit.points, self, checked, is_leaf=lambda leaf: leaf is None)
-
     @property
     def vertices(self) -> int:
-        """Number of vertices, or of points if the scene was moved to points by `at`."""
-        return sum(self.place.counts) if self.points is None else sum(map(len, self.points))
+        """Number of vertices."""
+        return sum(self.place.counts)
 
     @property
     def shared_light(self) -> tuple | None:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int, PyTree, UInt8
 from jaxprt.compile import jit, kept, mapped
 from jaxprt.relit.groups import Surface, VertexMaterials, material
 from jaxprt.scene.material_table import MaterialLook
-from jaxprt.scene.points import Points, placed
+from jaxprt.scene.points import VERTICES, Points, placed
 from jaxprt.sphere import directions
 from jaxprt.systems import bright_texels, protocol
 from jaxprt.systems.lamps import LampTransport
@@ -45,13 +45,13 @@ class Viewed(eqx.Module):
     """Points of a group with all that does not depend on the light.
 
     Attributes:
-        points: The points on the group; None for its vertices.
+        points: The points on the group.
         seen: The view of each system of the group: direct light, reflected light and lamps.
         emitted: Radiance that the points emit; None for a group that does not emit.
         sight: What single texels of the light need; None where they are not summed one by one.
     """
 
-    points: Points | None
+    points: Points
     seen: tuple[PyTree, PyTree, PyTree]
     emitted: Float[Array | np.ndarray, "p 3"] | None
     sight: Sight | None = None
@@ -152,7 +152,7 @@ def _from_texels(
     light = texel, excess / picture_rays.FULL, share
     options = {"size": size, "samples": samples, "place": place}
     return bright_texels.texel_radiance(
-        surface.brdf, sight.frame, sight.wo, light, None, sight.blend, above=sight.above, **options
+        surface.brdf, sight.frame, sight.wo, light, VERTICES, sight.blend, above=sight.above, **options
     )
 
 
@@ -167,46 +167,33 @@ def view_of(
     surface: Surface,
     eye: Float[Array, "*p 3"],
     blend: Blend | None,
-    points: Points | None,
+    points: Points,
     sharp: Array | None,
     *,
     variance: Array | None = None,
     lamps: LampTransport | None = None,
 ) -> tuple[PyTree, PyTree, PyTree]:
-    """The view of all systems of a group at its vertices, or at points on it.
+    """The view of all systems of a group at points on it.
 
     Args:
         surface: The group.
-        eye: Position of the viewer: one, or one for each vertex or point.
+        eye: Position of the viewer: one, or one for each point.
         blend: Weights of the channels there.
-        points: The points; None for the vertices.
+        points: The points.
         sharp: 1 where narrow lobes are traced by rays, 0 elsewhere; None for a group without rays.
         variance: Variance in squared radians by which lobes are widened; see `jaxprt.systems.lobe.widened`.
         lamps: The transport of the lamps to the points; None to interpolate it between vertices.
     """
-    system, reflecting = surface.system if points is None else surface.system.at(points), surface.reflecting
-    reflected = None
-    if reflecting is not None:
-        reflected = reflecting.view(eye, blend, points, sharp)
-    lit = None
-    if lamps is not None:
-        lit = _lit_at(surface, points, lamps, eye, blend, sharp)
-    elif surface.lit is not None:
-        lit = surface.lit.view(eye, blend, points, sharp)
+    system, reflecting, lit = surface.system, surface.reflecting, surface.lit
+    reflected = None if reflecting is None else reflecting.view(eye, blend, points, sharp)
+    if lit is not None and lamps is not None:
+        lamps = lamps if points.normal is None else lamps.tilted(points.frame(surface.frame))
+        lit = lit.at(lamps).view(eye, blend, traced=sharp)
+    elif lit is not None:
+        lit = lit.view(eye, blend, points, sharp)
     if variance is not None and widened.can_widen(system):
-        return widened.view(system, eye, blend, variance), reflected, lit
-    return system.view(eye, blend), reflected, lit
-
-
-def _lit_at(
-    surface: Surface, points: Points | None, lamps: LampTransport, eye: Array, blend: Blend | None, sharp: Array | None
-) -> Float[Array, "n p c"] | None:
-    """Radiance that points send to the eye, per lamp, from the transport of the lamps to the points."""
-    if surface.lit is None:
-        return None
-    if points is not None and points.normal is not None:
-        lamps = lamps.tilted(points.frame(surface.frame))
-    return surface.lit.at(lamps).view(eye, blend, None, sharp)
+        return widened.view(system, eye, blend, points, variance), reflected, lit
+    return system.view(eye, blend, points), reflected, lit
 
 
 @kept
@@ -214,16 +201,14 @@ def _lit(
     surface: Surface,
     arriving: tuple[PyTree, PyTree, PyTree],
     seen: tuple[PyTree, PyTree, PyTree],
-    points: Points | None,
+    points: Points,
     emitted: Float[Array, "_ 3"] | None,
 ) -> Float[Array, "_ c"]:
     """Radiance of the light that arrives at a group and of emission."""
-    system = surface.system if points is None else surface.system.at(points)
     if isinstance(seen[0], widened.WidenedView):
-        assert widened.can_widen(system)
-        color = widened.combine(system, arriving[0], seen[0])
+        color = widened.combine(surface.system, arriving[0], seen[0], points)
     else:
-        color = system.combine(arriving[0], seen[0])
+        color = surface.system.combine(arriving[0], seen[0], points)
     if surface.reflecting is not None:
         color = color + surface.reflecting.combine(arriving[1], seen[1], points)
     if surface.lit is not None:

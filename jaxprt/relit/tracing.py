@@ -43,20 +43,18 @@ class RayOrigins(eqx.Module):
     Attributes:
         number: Index of the group.
         points: The points in the scene.
-        on_group: The points on the group; None for all its vertices.
+        on_group: The points on the group.
         blend: Material weights of the vertices or points.
         share: 1 where narrow lobes are traced, 0 elsewhere; None for 1 everywhere.
         lamps: The transport of the lamps to the points; None to interpolate it between vertices.
-        at_vertices: Whether the points are vertices, from which rays start elsewhere than from points of triangles.
     """
 
     number: int = eqx.field(static=True)
     points: Points
-    on_group: Points | None
+    on_group: Points
     blend: Blend | None
     share: Float[Array, " v"] | None
     lamps: LampTransport | None = None
-    at_vertices: bool = eqx.field(static=True, default=False)
 
     @property
     def parameter(self) -> tuple[Float[Array, " v"], ...]:
@@ -148,7 +146,7 @@ def trace(stage: Stage, origins: Sequence[RayOrigins], eye: Float[Array, "3"], *
     for origin in origins:
         with jax.ensure_compile_time_eval():
             bundle = _reflecting(stage, origin).rays(eye, origin.parameter, origin.on_group, origin.share)
-            hit = cast.cast(bundle, origin.points, at_vertices=origin.at_vertices)
+            hit = cast.cast(bundle, origin.points, at_vertices=origin.on_group.all_vertices)
             hits.append((*hit, cast.spread(bundle, *hit)))
             rays.append(bundle)
     slots, rows = _rows(stage, cast, hits, keep=keep)

@@ -19,29 +19,42 @@ _ROUNDED = 1e-4  # tolerance of barycentric coordinates
 
 
 class Points(eqx.Module):
-    """Points on the triangles of a mesh, in barycentric coordinates.
+    """Points on the triangles of a mesh, in barycentric coordinates; without any, all vertices in their order.
 
     Attributes:
-        corner: Vertex indices of each point's triangle.
-        weight: Barycentric coordinates, which sum to 1.
+        corner: Vertex indices of each point's triangle; None for all vertices.
+        weight: Barycentric coordinates, which sum to 1; None for all vertices.
         slope: Change of the barycentric coordinates from one pixel to the next, to the right and down; None for points
             that do not belong to a picture.
         normal: Unit shading normals in world space, where normal maps tilt them; None for those of the vertices,
             interpolated.
     """
 
-    corner: Int[Array | np.ndarray, "k p"]
-    weight: Float[Array | np.ndarray, "k p"]
+    corner: Int[Array | np.ndarray, "k p"] | None = None
+    weight: Float[Array | np.ndarray, "k p"] | None = None
     slope: Float[Array | np.ndarray, "2 k p"] | None = None
     normal: Float[Array | np.ndarray, "3 p"] | None = None
 
-    def __len__(self) -> int:
-        """Number of points."""
-        return self.corner.shape[1]
+    @property
+    def all_vertices(self) -> bool:
+        """Whether these are all vertices, so that nothing is interpolated."""
+        return self.corner is None
 
-    def carry(self, attribute: Num[Array | np.ndarray, "..."], *, axis: int = 0) -> Float[Array, "..."]:
+    def __len__(self) -> int:
+        """Number of points that are not all vertices."""
+        return np.shape(self.corner)[1]
+
+    def count(self, vertices: int) -> int:
+        """Number of points on a mesh with a number of vertices."""
+        return vertices if self.corner is None else len(self)
+
+    def corners(self, vertices: int) -> Int[Array | np.ndarray, "k p"]:
+        """The vertices from which each point is interpolated: itself alone if these are all vertices."""
+        return np.arange(vertices, dtype=np.int32)[None] if self.corner is None else self.corner
+
+    def carry(self, attribute: Num[Array | np.ndarray, "..."], *, axis: int = 0) -> Num[Array | np.ndarray, "..."]:
         """Interpolates a vertex attribute at the points. The vertices are along `axis`; the result is linear in it."""
-        return _carry(self.corner, self.weight, attribute, axis=axis)
+        return attribute if self.corner is None else _carry(self.corner, self.weight, attribute, axis=axis)
 
     def slopes(self, attribute: Float[Array | np.ndarray, "v c"]) -> Float[Array, "2 p c"]:
         """Change of a vertex attribute from one pixel to the next, to the right and down."""
@@ -54,6 +67,8 @@ class Points(eqx.Module):
 
     def check(self, vertices: int) -> None:
         """Refuses points that refer to missing vertices or lie outside of their triangles; not inside of `jax.jit`."""
+        if self.corner is None and self.weight is None:
+            return
         shapes = list(np.shape(self.corner)), list(np.shape(self.weight))
         if len(shapes[0]) != 2 or shapes[0] != shapes[1]:
             raise ValueError(f"points must have corners [k, p] and weights [k, p], got {shapes[0]} and {shapes[1]}")
@@ -65,7 +80,7 @@ class Points(eqx.Module):
                 worst = int(np.argmax(np.abs(total - 1)))
                 raise ValueError(f"the weights of points must sum to 1, got {total[worst]:g} at point {worst}")
 
-    def frame(self, frame: Float[Array, "v 3 3"]) -> Float[Array, "p 3 3"]:
+    def frame(self, frame: Float[Array | np.ndarray, "v 3 3"]) -> Float[Array | np.ndarray, "p 3 3"]:
         """Shading frames at the points: normals are interpolated and normalized, tangents made orthogonal to them.
 
         Points with normals of their own have these in place of the interpolated ones.
@@ -73,7 +88,10 @@ class Points(eqx.Module):
         Args:
             frame: Shading frames of the vertices; rows are tangent, bitangent, normal.
         """
-        return _frames(self.corner, self.weight, frame, self.normal)
+        return frame if self.corner is None and self.normal is None else _frames(self, frame)
+
+
+VERTICES = Points()  # all vertices of any mesh
 
 
 @partial(jit, static_argnames="axis")
@@ -90,16 +108,17 @@ def _carry(corner: Array, weight: Array, attribute: Array, *, axis: int) -> Arra
 
 
 @jit
-def _frames(corner: Array, weight: Array, frame: Array, normal: Array | None) -> Array:
-    rows = _carry(corner, weight, frame[:, ::2].reshape(len(frame), 6), axis=0)
-    return directions.frame(directions.normalize(rows[:, 3:]) if normal is None else normal.T, rows[:, :3])
+def _frames(points: Points, frame: Array) -> Array:
+    rows = points.carry(frame[:, ::2].reshape(len(frame), 6))
+    normal = directions.normalize(rows[:, 3:]) if points.normal is None else points.normal.T
+    return directions.frame(normal, rows[:, :3])
 
 
 def placed(
-    position: Float[Array, "v 3"], frame: Float[Array, "v 3 3"], points: Points | None
-) -> tuple[Float[Array, "p 3"], Float[Array, "p 3 3"]]:
-    """Positions and shading frames of points, or of the vertices if `points` is None."""
-    return (position, frame) if points is None else (points.carry(position), points.frame(frame))
+    position: Float[Array | np.ndarray, "v 3"], frame: Float[Array | np.ndarray, "v 3 3"], points: Points
+) -> tuple[Float[Array | np.ndarray, "p 3"], Float[Array | np.ndarray, "p 3 3"]]:
+    """Positions and shading frames of points."""
+    return points.carry(position), points.frame(frame)
 
 
 def on_triangles(

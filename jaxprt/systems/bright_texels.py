@@ -16,7 +16,7 @@ from jaxprt import require
 from jaxprt.brdf import grid
 from jaxprt.compile import jit, mapped, total
 from jaxprt.scene.environment import Environment
-from jaxprt.scene.points import Points
+from jaxprt.scene.points import VERTICES, Points, placed
 from jaxprt.sphere import cubemap, directions
 from jaxprt.systems import adaptive, protocol
 from jaxprt.systems.protocol import Blend, System, VertexSystem
@@ -111,8 +111,7 @@ class BrightTexels(VertexSystem):
         source = "jaxprt.visibility.precompute or jaxprt.lobe.precompute"
         require.kind("the system", self.system, System, source="jaxprt.lobe.LobeSystem or another system")
         require.kind("the visibility", self.visibility, Visibility, source=source)
-        if self.points is None:
-            require.length("vertices of the visibility", self.visibility.position, self.system.vertices)
+        require.length("vertices of the visibility", self.visibility.position, self.system.vertices)
 
     def light(self, environment: Environment) -> BrightLight:
         """Splits the light into its brightest texels and the rest, which the underlying system converts."""
@@ -136,33 +135,34 @@ class BrightTexels(VertexSystem):
         """The light, whose rest is that of the underlying system: `System.tilted`."""
         return dataclasses.replace(light, rest=self.system.tilted(light.rest, normal))
 
-    def view(self, eye: Float[Array, "*p 3"], materials: PyTree = None) -> BrightView:
+    def view(self, eye: Float[Array, "*p 3"], materials: PyTree = None, points: Points = VERTICES) -> BrightView:
         """The view of the underlying system, and the frames and directions for which the bright texels are summed."""
-        position, frame = self.place(self.visibility)
-        eye = require.position("the eye", eye, points=self.vertices)
-        return BrightView(self.system.view(eye, materials), frame, directions.view(frame, position, eye), materials)
+        rest = self.system.view(eye, materials, points)
+        position, frame = placed(*self.placement, points)
+        eye = require.position("the eye", eye, points=len(position))
+        return BrightView(rest, frame, directions.view(frame, position, eye), materials)
 
-    def combine(self, light: BrightLight, view: BrightView) -> Float[Array, "v c"]:
+    def combine(self, light: BrightLight, view: BrightView, points: Points = VERTICES) -> Float[Array, "p c"]:
         """Radiance: the sum of that of the underlying system and that of the bright texels."""
         require.kind("the light", light, BrightLight, source="BrightTexels.light")
         require.kind("the view", view, BrightView, source="BrightTexels.view")
-        light, rest = self._seen(light), self.system.combine(light.rest, view.rest)
+        light, rest = self._seen(light), self.system.combine(light.rest, view.rest, points)
         if light.flux is not None:
-            return rest + self._diffuse(light.flux, view).T * self.system.diffuse_albedo(view.rest)
+            return rest + self._diffuse(light.flux, view, points).T * self.system.diffuse_albedo(view.rest)
         texels = light.texel, light.excess / LEVELS, light.seen
         options = {"size": self.visibility.size, "samples": self.samples}
         brdf = grid.as_argument(self.brdf)
-        return rest + texel_radiance(brdf, view.frame, view.wo, texels, self.points, view.blend, **options)
+        return rest + texel_radiance(brdf, view.frame, view.wo, texels, points, view.blend, **options)
 
-    def _diffuse(self, flux: Float[Array, "c 4 v"], view: BrightView) -> Float[Array, "c _"]:
+    def _diffuse(self, flux: Float[Array, "c 4 v"], view: BrightView, points: Points) -> Float[Array, "c _"]:
         """Irradiance / pi by the bright texels: max(F . n + max(E - F . m, 0), 0)."""
-        if self.points is None:
+        if points.all_vertices and points.normal is None:
             return flux[:, 3]
         # F and E are the vector and irradiance of vertices, interpolated; m is the smooth normal, n that with the map.
-        flux, normal = self.carried(flux, axis=2), view.frame[:, 2].T
+        flux, normal = points.carry(flux, axis=2), view.frame[:, 2].T
         smooth = normal
-        if self.points.normal is not None:
-            smooth = self.points.tilted(None).frame(self.visibility.frame)[:, 2].T
+        if points.normal is not None:
+            smooth = points.tilted(None).frame(self.visibility.frame)[:, 2].T
         upright, tilted = (jnp.sum(flux[:, :3] * axis, 1) for axis in (smooth, normal))
         # Between vertices a sun's vector stays as it is, that of light from everywhere turns with the normal. F is too
         # short for the second kind, and E too dark for the first.
@@ -172,15 +172,6 @@ class BrightTexels(VertexSystem):
         """The albedo of the underlying system."""
         return self.system.diffuse_albedo(view.rest)
 
-    def at(self, points: Points) -> "BrightTexels":
-        """The system at points; see `System.at`."""
-        return eqx.tree_at(
-            lambda bright: (bright.points, bright.system),
-            self,
-            (points, self.system.at(points)),
-            is_leaf=lambda x: x is None,
-        )
-
     @property
     def matte(self) -> bool:
         """Whether the underlying system is ideally diffuse."""
@@ -188,7 +179,7 @@ class BrightTexels(VertexSystem):
 
     @property
     def vertices(self) -> int:
-        """Number of vertices, or of points where radiance is evaluated at points."""
+        """Number of vertices."""
         return self.system.vertices
 
     @property
@@ -364,7 +355,7 @@ def radiance(
     eye = require.position("the eye", eye)
     wo = directions.view(transport.frame, transport.position, eye)
     light = texel, excess, transport.visible(texel)
-    return texel_radiance(brdf, transport.frame, wo, light, None, blend, size=transport.size, samples=samples)
+    return texel_radiance(brdf, transport.frame, wo, light, VERTICES, blend, size=transport.size, samples=samples)
 
 
 def _floating_excess(transport: Visibility, texel: Array, excess: Array) -> Array:
@@ -381,7 +372,7 @@ def texel_radiance(
     frame: Float[Array, "p 3 3"],
     wo: Float[Array, "p 3"],
     light: tuple[Int[Array, " t"], Float[Array, "t c"], UInt8[Array, "t v"] | Float[Array, "t v"]],
-    points: Points | None,
+    points: Points,
     blend: Blend | None,
     *,
     size: int,
@@ -397,7 +388,7 @@ def texel_radiance(
         wo: Unit directions to the viewer in these frames.
         light: Indices of the texels, their radiance, and their visible share at the vertices. Only the product of the
             last two matters, so shares may be in sixteenths if the radiance is divided by 16.
-        points: Points to which the shares are interpolated; None for shares of the vertices or points themselves.
+        points: Points to which the shares are interpolated; all vertices for shares of the points themselves.
         blend: Weights of the BRDF's channels, and parameters; None for the BRDF as it is.
         size: Edge of the cubemap faces in texels.
         samples: Number of sample points along the edge of each texel.
@@ -421,8 +412,8 @@ def texel_radiance(
         direction, area, number = argument
 
         def seen(visible):
-            share = visible.astype(wo.dtype) if points is None or carried else points.carry(visible)
-            reflected = point(direction, area) * share
+            share = visible if carried else points.carry(visible)
+            reflected = point(direction, area) * share.astype(wo.dtype)
             if weight is not None:
                 reflected = jnp.sum(reflected[:, None] * weight, 0)
             return reflected * excess[number][:, None]
@@ -444,8 +435,8 @@ def texel_radiance(
         excess, visible = (jnp.zeros((1, rows.shape[1]), rows.dtype) for rows in (excess, visible))
     direction, area = (row.astype(excess.dtype) for row in _points(texel, size, samples, place))
     count = direction.shape[1]
-    carried = count > 1
-    if points is not None and carried:
+    carried = count > 1 and not points.all_vertices
+    if carried:
         visible = mapped(points.carry, visible)
     # Sample points are processed one by one, so that intermediate arrays stay in the processor's cache. A loop over the
     # points of a texel within one over texels takes three times as long on CPUs.

@@ -16,7 +16,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, PyTree
 
 from jaxprt.scene.environment import Environment
-from jaxprt.scene.points import Points
+from jaxprt.scene.points import VERTICES, Points
 from jaxprt.systems import protocol
 from jaxprt.systems.axes import leaves, map_leaves
 from jaxprt.systems.protocol import Blend, System, VertexSystem
@@ -46,19 +46,14 @@ class Padded(System):
         """Light that arrives at the vertices, padding included."""
         return self.system.shade(light, self._pad(materials))
 
-    def view(self, eye: Float[Array, "3"], materials: Blend | None = None) -> PyTree:
+    def view(self, eye: Float[Array, "3"], materials: Blend | None = None, points: Points = VERTICES) -> PyTree:
         """The view of the system."""
-        return self.system.view(eye, self._pad(materials))
+        protocol.check_points(points, self.count)
+        return self.system.view(eye, self._pad(materials) if points.all_vertices else materials, points)
 
-    def combine(self, light: PyTree, view: PyTree) -> Float[Array, "v c"]:
-        """Radiance of the vertices, without padding."""
-        return self.system.combine(light, view)[: self.count]
-
-    def at(self, points: Points) -> System:
-        """The system at points; see `System.at`."""
-        if isinstance(points, Points):
-            points.check(self.count)
-        return self.system.at(points)
+    def combine(self, light: PyTree, view: PyTree, points: Points = VERTICES) -> Float[Array, "p c"]:
+        """Radiance of the points, without padding."""
+        return self.system.combine(light, view, points)[: points.count(self.count)]
 
     @property
     def vertices(self) -> int:
@@ -118,7 +113,7 @@ def _mesh(devices: Any) -> jax.sharding.Mesh:
 
 def _even(value: Any, shares: int) -> Any:
     """The system, padded if its number of vertices is not divisible by the number of shares."""
-    if not isinstance(value, VertexSystem) or value.points is not None:
+    if not isinstance(value, VertexSystem):
         return value
     step = shares * (BLOCK if any("block" in axes for axes, _ in leaves(value)) else 1)
     count = value.vertices

@@ -8,7 +8,7 @@ radiance = system.combine(A, V)        one row per vertex, in the order of the m
 
 import abc
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -21,7 +21,7 @@ from jaxprt import require
 from jaxprt.compile import mapped, promoted
 from jaxprt.scene import origin as origins
 from jaxprt.scene.environment import Environment
-from jaxprt.scene.points import Points, placed
+from jaxprt.scene.points import VERTICES, Points, placed
 
 CHANNELS = 4  # most channels of a BRDF's table that exported pages hold
 _KNOTS = 64  # most knots of its parameter
@@ -68,61 +68,51 @@ class System(eqx.Module):
         return light
 
     @abc.abstractmethod
-    def view(self, eye: Float[Array, "3"], materials: PyTree = None) -> PyTree:
+    def view(self, eye: Float[Array, "3"], materials: PyTree = None, points: Points = VERTICES) -> PyTree:
         """Evaluates the view and the materials in the form that this system uses. Call it again when either changes.
 
         Args:
             eye: Position of the viewer in world units.
-            materials: Materials of the vertices, as a `Blend` or as the system documents; None for those of the BRDF.
+            materials: Materials of the points, as a `Blend` or as the system documents; None for those of the BRDF.
+            points: Points on the triangles of the mesh, each with its own position, frame, view and BRDF; by default
+                its vertices. A scene takes a list with those of each part.
 
         Raises:
-            TypeError: The materials have a type that the system does not accept.
-            ValueError: The eye is not one finite position, or the materials do not fit the vertices.
+            TypeError: The materials have a type that the system does not accept, or `points` is something else.
+            ValueError: The eye is not one finite position, or the materials do not fit the points, or these do not lie
+                on triangles of the mesh.
         """
 
     @abc.abstractmethod
-    def combine(self, light: PyTree, view: PyTree) -> Float[Array, "v c"]:
-        """Linear radiance that each vertex sends to the eye, in the order of the mesh's vertices.
+    def combine(self, light: PyTree, view: PyTree, points: Points = VERTICES) -> Float[Array, "p c"]:
+        """Linear radiance that each point sends to the eye, in their order.
 
         Args:
-            light: The result of `shade`; without bounces also that of `light`.
+            light: The result of `shade`; without bounces also that of `light`. It is interpolated to the points.
             view: The result of `view`.
+            points: The points of the view.
 
         Raises:
             TypeError: The light or the view was not made by this kind of system.
         """
 
     def under_lights(
-        self, lights: Float[Array, "l 6 n n c"], view: PyTree, materials: PyTree = None
-    ) -> Float[Array, "l v _"]:
+        self, lights: Float[Array, "l 6 n n c"], view: PyTree, materials: PyTree = None, points: Points = VERTICES
+    ) -> Float[Array, "l p _"]:
         """Radiance under several lights by one program.
 
         Args:
             lights: Radiance of the environments.
             view: The result of `view`.
-            materials: As for `view`.
+            materials: Materials of the vertices, for `shade`.
+            points: The points of the view.
         """
-        return _relit(self, projected(self, lights), view, materials)
-
-    @abc.abstractmethod
-    def at(self, points: Any) -> "System":
-        """The same system, evaluated at surface points instead of vertices. The result of `light` serves both.
-
-        `radiance(system.at(points), ...)` returns one row per point, in their order, and takes materials of the points.
-        Light that arrives at vertices is interpolated; each point has its own position, frame, view and BRDF.
-
-        Args:
-            points: `Points` on the triangles of the mesh. A system of several parts takes a list with one `Points` for
-                each part.
-
-        Raises:
-            TypeError: `points` is neither `Points` nor such a list.
-        """
+        return _relit(self, projected(self, lights), view, materials, points)
 
     @property
     @abc.abstractmethod
     def vertices(self) -> int:
-        """Number of vertices, or of points."""
+        """Number of vertices."""
 
     @property
     def matte(self) -> bool:
@@ -313,35 +303,17 @@ class Exported(eqx.Module):
 
 
 class VertexSystem(System):
-    """A system for the vertices of one mesh, or for points on its triangles.
+    """A system for the vertices of one mesh."""
 
-    Attributes:
-        points: Points at which radiance is evaluated; None for the vertices.
-    """
+    @property
+    def vertices(self) -> int:
+        """Number of vertices."""
+        return len(self.growing.position)
 
-    points: Points | None = eqx.field(default=None, kw_only=True)
-
-    def at(self, points: Points) -> "VertexSystem":
-        """The same system at points: `System.at`.
-
-        Raises:
-            ValueError: The points do not lie on triangles of the mesh.
-        """
-        require.kind("the points", points, Points, source="jaxprt.scene.points.on_triangles")
-        points.check(_place(self, None).vertices)
-        return _place(self, points)
-
-    def carried(self, attribute: Float[Array, "..."], *, axis: int = 0) -> Float[Array, "..."]:
-        """Interpolates an attribute of the vertices to the points; returns it as it is without points."""
-        return attribute if self.points is None else self.points.carry(attribute, axis=axis)
-
-    def place(self, transport: Any) -> tuple[Float[Array, "v 3"], Float[Array, "v 3 3"]]:
-        """Positions and frames of the points, or those of the vertices, which `transport` holds."""
-        return placed(transport.position, transport.frame, self.points)
-
-
-def _place(system: VertexSystem, points: Points | None) -> VertexSystem:
-    return eqx.tree_at(lambda system: system.points, system, points, is_leaf=lambda leaf: leaf is None)
+    def placed(self, points: Points) -> tuple[Float[Array, "p 3"], Float[Array, "p 3 3"]]:
+        """Positions and frames of points on the mesh, which are checked."""
+        check_points(points, self.vertices)
+        return placed(self.growing.position, self.growing.frame, points)
 
 
 def _parameters(value: Any) -> Any:
@@ -389,26 +361,26 @@ class Blend(eqx.Module):
             )
 
 
-def albedo_view(
-    albedo: Float[Array, " c"], eye: Float[Array, "*p 3"], blend: Blend | None, *, vertices: int
-) -> Float[Array, "_ d"]:
-    """The view of an ideally diffuse system: the albedo of all vertices, or of each vertex with a blend.
+def albedo_view(system: Any, eye: Float[Array, "*p 3"], blend: Blend | None, points: Points) -> Float[Array, "_ d"]:
+    """The view of an ideally diffuse system: the albedo of all points, or of each point with a blend.
 
     Args:
-        albedo: Albedo of all vertices, gray or per color.
+        system: The system, which has an albedo, gray or per color.
         eye: Position of the viewer in world units, on which the view does not depend.
-        blend: Albedo of each vertex, as weights of one channel; None for `albedo`.
-        vertices: Number of vertices or points.
+        blend: Albedo of each point, as weights of one channel; None for that of the system.
+        points: The points.
 
     Raises:
-        TypeError: The blend is not a `Blend`.
-        ValueError: The eye is not finite, or the blend has another number of vertices or channels.
+        TypeError: The blend is not a `Blend`, or `points` is something else.
+        ValueError: The eye is not finite, or the blend has another number of points or channels.
     """
     check_blend(blend)
-    require.position("the eye", eye, points=vertices)
+    check_points(points, system.vertices)
+    count = points.count(system.vertices)
+    require.position("the eye", eye, points=count)
     if blend is None:
-        return albedo[None]
-    blend.check(vertices, 1)
+        return system.albedo[None]
+    blend.check(count, 1)
     return blend.weight[:, 0]
 
 
@@ -454,41 +426,30 @@ class Total(System):
         require.kind("the light", light, tuple, source="Total.light")
         return tuple(system.shade(lit, materials) for system, lit in zip(self.part, light, strict=True))
 
-    def view(self, eye: Float[Array, "3"], materials: PyTree = None) -> tuple[PyTree, ...]:
+    def view(self, eye: Float[Array, "3"], materials: PyTree = None, points: Any = VERTICES) -> tuple[PyTree, ...]:
         """The view of each system."""
-        return tuple(system.view(eye, materials) for system in self.part)
+        return tuple(system.view(eye, materials, points) for system in self.part)
 
     @promoted
-    def combine(self, light: tuple[PyTree, ...], view: tuple[PyTree, ...]) -> Float[Array, "v c"]:
+    def combine(
+        self, light: tuple[PyTree, ...], view: tuple[PyTree, ...], points: Any = VERTICES
+    ) -> Float[Array, "p c"]:
         """The sum of the radiance of all systems."""
         require.kind("the light", light, tuple, source="Total.light")
         require.kind("the view", view, tuple, source="Total.view")
-        parts = (system.combine(*sides) for system, *sides in zip(self.part, light, view, strict=True))
+        parts = (system.combine(*sides, points) for system, *sides in zip(self.part, light, view, strict=True))
         return sum(parts, start=jnp.zeros((), jnp.result_type(float)))
-
-    def at(self, points: Any) -> "Total":
-        """The sum at points: `System.at`."""
-        return Total(tuple(system.at(points) for system in self.part))
 
     @property
     def vertices(self) -> int:
-        """Number of vertices, or of points."""
+        """Number of vertices."""
         return self.part[0].vertices
 
 
-def check_list(points: Any, parts: int) -> None:
-    """Refuses anything but a list with one entry for each part."""
-    if not isinstance(points, Sequence) or len(points) != parts:
-        raise TypeError(f"the points must be a list, one for each of {parts} parts, got {type(points).__name__}")
-
-
-def check_points(points: Any, vertices: Sequence[int]) -> tuple[Points, ...]:
-    """Refuses anything but a list with `Points` for each part; `vertices` are the numbers of vertices of the parts."""
-    check_list(points, len(vertices))
-    for of_part, count in zip(points, vertices, strict=True):
-        require.kind("the points", of_part, Points, source="jaxprt.scene.points.on_triangles")
-        of_part.check(count)
-    return tuple(points)
+def check_points(points: Any, vertices: int) -> None:
+    """Refuses anything but `Points` on the triangles of a mesh with a number of vertices."""
+    require.kind("the points", points, Points, source="jaxprt.scene.points.on_triangles")
+    points.check(vertices)
 
 
 def one_light(value: Any, *, size: int | None = None, batch: bool = False) -> Environment:
@@ -551,20 +512,28 @@ def total(*systems: System) -> Total:
 
 @promoted
 def radiance(
-    system: System, environment: Environment | PyTree, *, eye: Float[Array | np.ndarray, "3"], materials: PyTree = None
-) -> Float[Array, "*l v c"]:
-    """Radiance that each vertex sends to the eye. Calls the four methods of any system in order.
+    system: System,
+    environment: Environment | PyTree,
+    *,
+    eye: Float[Array | np.ndarray, "3"],
+    materials: PyTree = None,
+    points: Any = VERTICES,
+) -> Float[Array, "*l p c"]:
+    """Radiance that each vertex or point sends to the eye. Calls the four methods of any system in order.
 
     Args:
         system: The system.
         environment: The light, or a batch of them along leading axes; or one light in another form that the system's
             `light` takes, such as SH coefficients.
         eye: Position of the viewer in world units.
-        materials: Materials of the vertices, as a `Blend` or as the system documents; None for those of the BRDF.
+        materials: Materials of the vertices or points, as a `Blend` or as the system documents; None for those of the
+            BRDF.
+        points: Points on the triangles of the mesh, from `jaxprt.scene.points.on_triangles`; by default its vertices. A
+            scene takes a list with those of each part, and materials by part.
 
     Returns:
-        Linear radiance in the light's units, in the mesh's order of vertices. Differentiable in the light, the eye and
-        the materials.
+        Linear radiance in the light's units, in the order of the points, or of the mesh's vertices. Differentiable in
+        the light, the eye and the materials.
 
     Raises:
         TypeError: The first argument is not a system, the light is not an `Environment`, or the materials have a type
@@ -576,16 +545,14 @@ def radiance(
         environment = light_for(system, environment, batch=True)
     eye = require.position("the eye", origins.local("the eye", eye, system.origin))
     system = system.centered()
-    view = system.view(eye, materials)
-    if not isinstance(environment, Environment):
-        return system.combine(system.shade(system.light(environment), materials), view)
-    *batch, faces, rows, columns, colors = environment.radiance.shape
+    view = system.view(eye, materials, points)
+    batch = environment.radiance.shape[:-4] if isinstance(environment, Environment) else ()
     if not batch:
-        return system.combine(system.shade(system.light(environment), materials), view)
+        return system.combine(system.shade(system.light(environment), materials), view, points)
     if not math.prod(batch):
         raise ValueError(f"a batch of lights must hold at least one, got {list(environment.radiance.shape)}")
-    lights = environment.radiance.reshape(-1, faces, rows, columns, colors)
-    color = [system.under_lights(block, view, materials) for block in _blocks(lights, system.vertices)]
+    lights = environment.radiance.reshape(-1, *environment.radiance.shape[-4:])
+    color = [system.under_lights(block, view, materials, points) for block in _blocks(lights, system.vertices)]
     return jnp.concatenate(color).reshape(*batch, *color[0].shape[1:])
 
 
@@ -611,9 +578,9 @@ def arriving(system: System, light: PyTree, materials: PyTree) -> PyTree:
 
 
 @eqx.filter_jit
-def _relit(system: System, light: PyTree, view: PyTree, materials: PyTree) -> Float[Array, "l v _"]:
+def _relit(system: System, light: PyTree, view: PyTree, materials: PyTree, points: Points) -> Float[Array, "l p _"]:
     with jax.default_matmul_precision("highest"):
-        return mapped(lambda row: system.combine(arriving(system, row, materials), view), light)
+        return mapped(lambda row: system.combine(arriving(system, row, materials), view, points), light)
 
 
 def memory(system: System) -> int:

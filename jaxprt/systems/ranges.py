@@ -35,16 +35,14 @@ def take(value: Piece, start: int, stop: int) -> Piece:
         equal length share compiled programs.
 
     Raises:
-        TypeError: `value` has no vertices, has clusters of vertices (which a range would cut), or is a scene, a sum of
-            parts or a system at points; or `start` or `stop` is not a whole number.
+        TypeError: `value` has no vertices, has clusters of vertices (which a range would cut), or is a scene or a sum
+            of parts; or `start` or `stop` is not a whole number.
         ValueError: The range is empty or exceeds the vertices, or `start` is not a multiple of 64 with stored
             visibility.
     """
     start, stop = operator.index(start), operator.index(stop)
     if isinstance(value, System) and not isinstance(value, VertexSystem):
         raise TypeError(f"value must be a system of one mesh, such as RelitScene.part_system(0), got {_kind(value)}")
-    if isinstance(value, VertexSystem) and value.points is not None:
-        raise TypeError(f"value must be a system at vertices, got {_kind(value)} at points")
     value = jax.tree.map(_bare, value, is_leaf=lambda part: isinstance(part, SparseTransport))
     rows = list(leaves(value))
     counts = {leaf.shape[axes.index("v")] for axes, leaf in rows if "v" in axes}

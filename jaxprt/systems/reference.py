@@ -15,7 +15,7 @@ from jaxprt.compile import Between, finished, jit, known, mapped
 from jaxprt.scene import origin as origins
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh, relative
-from jaxprt.scene.points import Points, placed
+from jaxprt.scene.points import VERTICES, Points, placed
 from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.systems import adaptive, protocol
 from jaxprt.visibility.rays import BLOCK, PRECOMPUTE
@@ -32,7 +32,7 @@ def radiance(
     eye: Float[Array | np.ndarray, "3"],
     occluder: Mesh | None = None,
     vertex: np.ndarray | None = None,
-    points: Points | None = None,
+    points: Points = VERTICES,
     error: float = 1e-3,
     progress: bool = False,
     between: Between = None,
@@ -84,19 +84,17 @@ def radiance(
         channels = jax.eval_shape(brdf, direction, direction).shape
         protocol.check_colors(light.radiance.shape[-1], channels[-1] if len(channels) > 1 else 1)
     rays = visibility.Occluder(mesh if occluder is None else relative(occluder, mesh.origin))
-    if points is None:
+    if points.all_vertices:
         start = visibility.start_points(mesh, rays)
         vertex = visibility.rays.vertex_indices(mesh, vertex)
-        position, frame = mesh.position, directions.frame(mesh.normal, mesh.tangent)
     elif vertex is not None:
         raise ValueError("give either vertices or points, got both")
     else:
         start = visibility.point_starts(mesh, points)
         vertex = np.arange(len(points))
-        position, frame = placed(mesh.position, directions.frame(mesh.normal, mesh.tangent), points)
-    position, frame = np.asarray(position), np.asarray(frame)
+    position, frame = map(np.asarray, placed(mesh.position, directions.frame(mesh.normal, mesh.tangent), points))
     # Light arrives from above the smooth surface, whatever a normal map does to its normals.
-    above = frame[:, 2] if points is None or points.normal is None else _smooth(mesh, points)
+    above = frame[:, 2] if points.normal is None else _smooth(mesh, points)
     size = light.radiance.shape[-2]
     if isinstance(brdf, PerVertex) and brdf.vertices != len(position):
         raise ValueError(f"the BRDF must have parameters for the mesh's {len(position)} vertices, got {brdf.vertices}")

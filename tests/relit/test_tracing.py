@@ -120,7 +120,7 @@ def test_points_pictures_and_programs_agree_with_the_vertices(close):
     color = ready.radiance(light(), eye=EYE)
     face = np.asarray(mesh("floor").face)
     corners = on_triangles(face, np.arange(len(face)), np.eye(3, dtype=np.float32)[np.arange(len(face)) % 3])
-    whole = ready.at([corners, corners]).radiance(light(), eye=EYE)
+    whole = ready.radiance(light(), eye=EYE, points=[corners, corners])
     vertex = face[np.arange(len(face)), np.arange(len(face)) % 3]
     # Rays of vertices start a nudge off all of their triangles, those of points off their own.
     apart = (

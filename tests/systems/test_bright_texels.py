@@ -216,9 +216,9 @@ def test_bright_texels_on_matte_surfaces_are_one_vector_for_all_views(mesh, tran
     tilted = at.tilted(frame + 0.2 * np.roll(frame, 1, 1))
     upright = np.einsum("ckv,vk->vc", row[:, :3], frame)
     for place, normal in ((at, frame), (tilted, np.asarray(tilted.normal).T)):
-        points, under = system.at(place), diffuse.at(place)
         flux = np.einsum("ckv,vk->vc", row[:, :3], normal) + np.maximum(row[:, 3].T - upright, 0)
-        found = points.combine(lit, points.view(EYE)) - under.combine(lit.rest, under.view(EYE))
+        under = diffuse.combine(lit.rest, diffuse.view(EYE, None, place), place)
+        found = system.combine(lit, system.view(EYE, None, place), place) - under
         close(found, np.maximum(flux, 0) * np.asarray(albedo))
 
 
@@ -236,8 +236,8 @@ def test_points_of_a_matte_ball_are_lit_by_their_cosines(count, most):
     area = np.asarray(cubemap.vector_area(size=SIZE)).reshape(-1, 3)[np.asarray(lit.texel)]
     cosine = np.maximum(np.asarray(at.frame(seen.frame))[:, 2] @ area.T, 0)
     expected = cosine @ np.asarray(lit.excess) / np.pi
-    points, under = system.at(at), diffuse.at(at)
-    found = points.combine(lit, points.view(EYE)) - under.combine(lit.rest, under.view(EYE))
+    under = diffuse.combine(lit.rest, diffuse.view(EYE, None, at), at)
+    found = system.combine(lit, system.view(EYE, None, at), at) - under
     assert np.linalg.norm(found - expected) < most * np.linalg.norm(expected)
 
 

@@ -19,7 +19,7 @@ from jaxprt import bright_texels, dynamic, harmonic, lobe, separable, visibility
 from jaxprt.brdf import CookTorrance, Lambert, MetallicRoughness
 from jaxprt.scene import Environment, Mesh, builtin
 from jaxprt.scene.mesh import grid_face, join, make_mesh, split
-from jaxprt.scene.points import Points, on_triangles
+from jaxprt.scene.points import VERTICES, Points, on_triangles
 from jaxprt.sphere import cubemap
 from jaxprt.systems import protocol
 
@@ -213,15 +213,15 @@ def light(seed: int = 0, *, lamps: int = 2) -> Environment:
     return Environment(jnp.asarray(radiance, jnp.float32))
 
 
-def color_of(case: Case, environment: Environment) -> np.ndarray:
-    """Radiance of all vertices."""
-    return np.asarray(prt.radiance(case.system, environment, eye=EYE, materials=case.materials))
+def color_of(case: Case, environment: Environment, points: Any = VERTICES) -> np.ndarray:
+    """Radiance of all vertices, or of points."""
+    return np.asarray(prt.radiance(case.system, environment, eye=EYE, materials=case.materials, points=points))
 
 
 @jax.jit
-def relit(system: prt.System, environment: Environment, materials: Any) -> jax.Array:
-    """Radiance of all vertices by one program."""
-    return prt.radiance(system, environment, eye=EYE, materials=materials)
+def relit(system: prt.System, environment: Environment, materials: Any, points: Any = VERTICES) -> jax.Array:
+    """Radiance of all vertices, or of points, by one program."""
+    return prt.radiance(system, environment, eye=EYE, materials=materials, points=points)
 
 
 # How far pages are off systems at full resolution: lobes have diffuse light of degree 6, dynamic parts lose the tensor.
@@ -624,10 +624,10 @@ def test_each_device_has_an_equal_share_of_the_vertices(name, close):
         assert sum(map(np.prod, shares.values())) == array.size
     assert prt.memory(even) == prt.memory(case.system)
     points = Points(jnp.array([[0, 1], [1, 2], [2, 0]]), jnp.full((3, 2), 1 / 3))
-    there = [relit(system.at(points), light(), case.materials) for system in (case.system, spare)]
+    there = [relit(system, light(), case.materials, points) for system in (case.system, spare)]
     close(there[1], there[0], tolerance=2e-5)
     with pytest.raises(ValueError, match="corners of points must be between 0 and 2"):
-        spare.at(Points(jnp.full((3, 1), 3), jnp.full((3, 1), 1 / 3)))
+        spare.view(EYE, None, Points(jnp.full((3, 1), 3), jnp.full((3, 1), 1 / 3)))
 
 
 def test_materials_are_those_of_the_vertices_without_the_spare_ones(close):
@@ -658,18 +658,18 @@ def test_what_are_no_devices_and_what_has_no_vertices_are_refused():
         prt.shard(light(), [here])
 
 
-def at_points(case: Case, triangle: np.ndarray, weight: np.ndarray) -> tuple[prt.System, np.ndarray]:
-    """A system at points of some triangles, and their order there: scenes take one list for each part."""
+def points_of(case: Case, triangle: np.ndarray, weight: np.ndarray) -> tuple[Any, np.ndarray]:
+    """Points of some triangles, and their order: scenes take one list for each part."""
     face, region = np.asarray(case.mesh.face)[triangle], np.asarray(case.mesh.region)
     if not isinstance(case.system, prt.RelitScene):
-        return case.system.at(on_triangles(case.mesh.face, triangle, weight)), np.arange(len(triangle))
+        return on_triangles(case.mesh.face, triangle, weight), np.arange(len(triangle))
     lists, order = [], []
     for number in range(region.max() + 1):
         inside = np.flatnonzero(region[face[:, 0]] == number)
         place = np.cumsum(region == number) - 1
         lists.append(Points(jnp.asarray(place[face[inside]].T), jnp.asarray(weight[inside].T)))
         order.append(inside)
-    return case.system.at(lists), np.concatenate(order)
+    return lists, np.concatenate(order)
 
 
 @each_system
@@ -678,9 +678,9 @@ def test_radiance_at_the_corners_of_triangles_is_that_of_the_vertices(name, clos
     triangle = np.arange(len(case.mesh.face))
     for corner in (0, 2):
         weight = np.tile(np.eye(3, dtype=np.float32)[corner], (len(triangle), 1))
-        system, order = at_points(case, triangle, weight)
-        color = color_of(case._replace(system=system), light())
-        assert system.vertices == len(color) == len(triangle)
+        points, order = points_of(case, triangle, weight)
+        color = color_of(case, light(), points)
+        assert len(color) == len(triangle)
         close(color, color_of(case, light())[np.asarray(case.mesh.face)[order, corner]], tolerance=2e-5)
 
 
@@ -702,8 +702,8 @@ def test_radiance_at_points_is_the_exact_sum_there(name, close):
     position, frame = points.carry(visible.position), points.frame(visible.frame)
     exact = np.asarray(prt.reference.integrate(level.astype(np.uint8), position, frame, GLOSSY, light(), EYE))
     facing = np.sum(np.asarray(frame)[:, 2] * (np.asarray(EYE) - np.asarray(position)), 1) > 0.2
-    system, order = at_points(case, triangle, weight)
-    color, facing, exact = color_of(case._replace(system=system), light()), facing[order], exact[order]
+    lists, order = points_of(case, triangle, weight)
+    color, facing, exact = color_of(case, light(), lists), facing[order], exact[order]
     # What arrives in the frames of three vertices is interpolated there: this mesh is coarse.
     close(color[facing], exact[facing], tolerance=SYSTEMS[name].error + 0.05)
 
@@ -711,24 +711,24 @@ def test_radiance_at_points_is_the_exact_sum_there(name, close):
 @pytest.mark.parametrize("name", ["separable, clustered", "harmonic", "lobe, bright texels"])
 def test_points_go_through_programs_and_batches_and_have_gradients(name, close):
     case = case_of(name)
-    system, _ = at_points(case, *inside_triangles(case))
+    system, (points, _) = case.system, points_of(case, *inside_triangles(case))
 
     def seen(system, lit, eye):
-        color = system.combine(lit, system.view(eye, case.materials))
+        color = system.combine(lit, system.view(eye, case.materials, points), points)
         return jnp.sum(color), color
 
     lit, eyes = system.shade(system.light(light()), case.materials), np.stack([EYE, 2 * np.asarray(EYE)])
     batch = jax.jit(jax.vmap(jax.grad(seen, argnums=2, has_aux=True), (None, None, 0)))
     slope, color = batch(system, lit, eyes)
     assert np.isfinite(slope).all()
-    close(color[0], color_of(case._replace(system=system), light()), tolerance=2e-5)
+    close(color[0], color_of(case, light(), points), tolerance=2e-5)
 
 
 @each_system
 @pytest.mark.usefixtures("unchecked")
 def test_what_are_no_points_are_refused(name):
     with pytest.raises(TypeError, match="points must be"):
-        case_of(name).system.at(np.zeros(3))
+        case_of(name).system.view(EYE, None, np.zeros(3))
 
 
 OUTSIDE = [
@@ -747,7 +747,7 @@ def test_points_outside_of_triangles_are_refused(name):
     for corner, weight, message in OUTSIDE:
         wrong = Points(jnp.asarray(corner), jnp.asarray(weight))
         with pytest.raises(ValueError, match=message):
-            system.at([wrong] * 2 if isinstance(system, prt.RelitScene) else wrong)
+            system.view(EYE, None, [wrong] * 2 if isinstance(system, prt.RelitScene) else wrong)
 
 
 @each_system

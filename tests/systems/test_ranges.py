@@ -109,9 +109,8 @@ def test_ranges_of_transport_with_its_transpose_have_the_gradients_of_their_rows
 def test_what_is_no_system_of_one_mesh_has_no_ranges(sparse, brdf):
     mesh = builtin.sphere(rings=12, sectors=14)
     system = separable.SeparableSystem(sparse, brdf)
-    points = prt.scene.points.on_triangles(mesh.face, np.array([0, 1]), np.full((2, 3), 1 / 3, np.float32))
     part = prt.Part("ball", mesh, prt.brdf.Lambert(0.5))
     scene = prt.precompute(prt.Scene([part]), refine=False, system="harmonic", size=SIZE, progress=False)
-    for value in (mesh, scene, prt.total(system, system), system.at(points)):
+    for value in (mesh, scene, prt.total(system, system)):
         with pytest.raises(TypeError, match="value must be a"):
             ranges.take(value, 0, 2)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxprt import require
 from jaxprt.scene.environment import Environment
-from jaxprt.scene.points import Points
+from jaxprt.scene.points import VERTICES, Points
 from jaxprt.sphere import harmonics
 from jaxprt.systems.protocol import System, VertexSystem
 
@@ -60,26 +60,19 @@ class ReflectingSystem(VertexSystem):
         """The light, whose reflected part arrives alike at tilted normals: `System.tilted`."""
         return ReflectingLight(self.direct.tilted(light.direct, normal), light.irradiance)
 
-    def view(self, eye: Float[Array, "*p 3"], materials: PyTree = None) -> PyTree:
+    def view(self, eye: Float[Array, "*p 3"], materials: PyTree = None, points: Points = VERTICES) -> PyTree:
         """The view of the system of direct light, which has the albedo of the diffuse response."""
-        return self.direct.view(eye, materials)
+        return self.direct.view(eye, materials, points)
 
-    def combine(self, light: ReflectingLight, view: PyTree) -> Float[Array, "v c"]:
+    def combine(self, light: ReflectingLight, view: PyTree, points: Points = VERTICES) -> Float[Array, "p c"]:
         """Radiance: direct light, and irradiance times the albedo of the diffuse response."""
         require.kind("the light", light, ReflectingLight, source="ReflectingSystem.light")
-        reflected = self.carried(light.irradiance, axis=1).T * self.direct.diffuse_albedo(view)
-        return self.direct.combine(light.direct, view) + reflected
-
-    def at(self, points: Points) -> "ReflectingSystem":
-        """The system at points; see `System.at`."""
-        changed = points, self.direct.at(points)
-        return eqx.tree_at(
-            lambda system: (system.points, system.direct), self, changed, is_leaf=lambda leaf: leaf is None
-        )
+        reflected = points.carry(light.irradiance, axis=1).T * self.direct.diffuse_albedo(view)
+        return self.direct.combine(light.direct, view, points) + reflected
 
     @property
     def vertices(self) -> int:
-        """Number of vertices, or of points where radiance is evaluated at points."""
+        """Number of vertices."""
         return self.direct.vertices
 
     @property

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 from jaxprt import require
 from jaxprt.compile import jit, promoted
 from jaxprt.scene.environment import Environment
-from jaxprt.scene.points import Points, placed
+from jaxprt.scene.points import VERTICES, Points, placed
 from jaxprt.systems import harmonic
 from jaxprt.systems.bounces import traced
 from jaxprt.systems.bounces.functions import FunctionWeights
@@ -72,7 +72,7 @@ class ReflectingPart(eqx.Module):
         self,
         eye: Float[Array, "*p 3"],
         blend: Blend | None,
-        points: Points | None = None,
+        points: Points = VERTICES,
         seen: Float[Array, " _"] | None = None,
     ) -> Float[Array, "lm _ _"]:
         """Harmonics of the BRDF at each vertex or point for its view direction, without what rays represent.
@@ -80,7 +80,7 @@ class ReflectingPart(eqx.Module):
         Args:
             eye: Position of the viewer.
             blend: Weights and parameters of the channels at the vertices or points.
-            points: The points; None for the vertices.
+            points: The points; by default the vertices.
             seen: Factor of what rays represent, at each vertex or point; None for 1.
         """
         whole = harmonic.system.blended_view(self.brdf, *placed(self.position, self.frame, points), blend, eye=eye)
@@ -90,23 +90,23 @@ class ReflectingPart(eqx.Module):
         self,
         eye: Float[Array, "*p 3"],
         blend: Blend | None,
-        points: Points | None = None,
+        points: Points = VERTICES,
         seen: Float[Array, " _"] | None = None,
     ) -> Float[Array, "lm _ _"]:
         """Harmonics of what rays represent. The arguments are those of `view`."""
         return traced.harmonics_of(self._lobes(eye, _parameter(blend), points), blend, seen)
 
     def combine(
-        self, light: Float[Array, "lm _ _"], view: Float[Array, "lm _ _"], points: Points | None = None
+        self, light: Float[Array, "lm _ _"], view: Float[Array, "lm _ _"], points: Points = VERTICES
     ) -> Float[Array, "_ e"]:
         """Radiance of reflected light, without what rays represent. `light` is what arrives at the vertices."""
-        return harmonic.system.combine(light if points is None else points.carry(light, axis=2), view)
+        return harmonic.system.combine(points.carry(light, axis=2), view)
 
     def rays(
         self,
         eye: Float[Array, "3"],
         parameter: tuple[Float[Array, " _"], ...],
-        points: Points | None = None,
+        points: Points = VERTICES,
         seen: Float[Array, " _"] | None = None,
     ) -> ReflectionRays:
         """The rays of each vertex or point. Colors do not change them.
@@ -114,7 +114,7 @@ class ReflectingPart(eqx.Module):
         Args:
             eye: Position of the viewer.
             parameter: Parameters of the table at the vertices or points, as in `Blend`.
-            points: The points; None for the vertices.
+            points: The points; by default the vertices.
             seen: Factor of what rays represent, at each vertex or point; None for 1.
         """
         position, frame = placed(self.position, self.frame, points)
@@ -125,13 +125,13 @@ class ReflectingPart(eqx.Module):
         rays: ReflectionRays,
         eye: Float[Array, "3"],
         blend: Blend | None,
-        points: Points | None = None,
+        points: Points = VERTICES,
         seen: Float[Array, " _"] | None = None,
     ) -> Float[Array, "j _ c"]:
         """Factor of the radiance along each ray. The sum over the rays of a point is the albedo of its traced lobes."""
         return traced.weights(self._lobes(eye, _parameter(blend), points), rays, blend, seen)
 
-    def _lobes(self, eye: Array, parameter: tuple[Array, ...], points: Points | None) -> LobeMixture:
+    def _lobes(self, eye: Array, parameter: tuple[Array, ...], points: Points) -> LobeMixture:
         if self.lobe is None:
             raise ValueError("rays need a part with lobes, got one that reflects by harmonics alone")
         return traced.lookup(self.lobe, *placed(self.position, self.frame, points), eye, parameter)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from jaxprt import require
 from jaxprt.compile import jit
 from jaxprt.scene.environment import Environment
-from jaxprt.scene.points import Points, placed
+from jaxprt.scene.points import VERTICES, Points, placed
 from jaxprt.sphere import directions
 from jaxprt.systems import protocol
 from jaxprt.systems.dynamic.table import DynamicBrdf
@@ -100,43 +100,43 @@ class DynamicSystem(protocol.VertexSystem):
         self,
         eye: Float[Array, "*p 3"],
         materials: Blend | None = None,
-        variance: Float[Array, " v"] | None = None,
+        points: Points = VERTICES,
+        *,
+        variance: Float[Array, " p"] | None = None,
     ) -> DynamicView:
-        """View factors of the terms, and texels at which each vertex reads the blurred light for its lobes.
+        """View factors of the terms, and texels at which each point reads the blurred light for its lobes.
 
-        `variance`, in squared radians, widens the lobes of each vertex or point. It does not change the terms.
+        `variance`, in squared radians, widens the lobes of each point. It does not change the terms.
         """
         protocol.check_blend(materials)
-        eye = require.position("the eye", eye, points=self.vertices)
+        protocol.check_points(points, self.vertices)
+        count = points.count(self.vertices)
+        eye = require.position("the eye", eye, points=count)
         if materials is not None:
-            materials.check(self.vertices, self.brdf.channels)
-        wo = _direction(self.transport.position, self.transport.frame, self.points, eye)
-        return DynamicView(self.brdf.view(wo, materials), self.lobe_part.view(eye, materials, variance))
+            materials.check(count, self.brdf.channels)
+        wo = _direction(self.transport.position, self.transport.frame, points, eye)
+        lobes = self.lobe_part.view(eye, materials, points, variance=variance)
+        return DynamicView(self.brdf.view(wo, materials), lobes)
 
-    def combine(self, light: DynamicLight, view: DynamicView) -> Float[Array, "v c"]:
+    def combine(self, light: DynamicLight, view: DynamicView, points: Points = VERTICES) -> Float[Array, "p c"]:
         """Radiance: terms, lobes and the diffuse part."""
         require.kind("the light", light, DynamicLight, source="DynamicSystem.light")
         require.kind("the view", view, DynamicView, source="DynamicSystem.view")
         light = self.shade(light) if light.arriving is None else light
         assert light.arriving is not None
-        result = self.lobe_part.combine(light.blurred, view.lobes)
+        result = self.lobe_part.combine(light.blurred, view.lobes, points)
         if not self.brdf.terms:
             return result
-        return result + combine(self.carried(light.arriving), view.factor)
+        return result + combine(points.carry(light.arriving), view.factor)
 
     @property
     def lobe_part(self) -> LobeSystem:
         """The lobes and the diffuse part alone, without the tensor: what exported pages show."""
-        return LobeSystem(self.transport.pyramid, self.brdf.lobe, points=self.points)
+        return LobeSystem(self.transport.pyramid, self.brdf.lobe)
 
     def exported(self, what: str) -> protocol.Exported:
         """That of the lobes, without the tensor."""
         return self.lobe_part.exported(what)
-
-    @property
-    def vertices(self) -> int:
-        """Number of vertices, or of points where radiance is evaluated at points."""
-        return len(self.transport.position if self.points is None else self.points)
 
     @property
     def shared_light(self) -> tuple:
@@ -145,11 +145,11 @@ class DynamicSystem(protocol.VertexSystem):
 
 
 @jit
-def _direction(position: Array, frame: Array, points: Points | None, eye: Array) -> Float[Array, "v 3"]:
+def _direction(position: Array, frame: Array, points: Points, eye: Array) -> Float[Array, "v 3"]:
     """Directions to the viewer in the frames of the light factors."""
     place, axes = placed(position, frame, points)
     wo = directions.view(axes, place, eye)
-    if points is None or points.normal is None:
+    if points.normal is None:
         return wo
     # Light factors are in frames without the normal map. Points are seen from where the mirror direction of the tilted
     # normal is also that of the frame.

@@ -21,6 +21,7 @@ from jaxprt import require
 from jaxprt.brdf.models import scalar
 from jaxprt.compile import jit, promoted
 from jaxprt.scene.environment import Environment
+from jaxprt.scene.points import VERTICES, Points
 from jaxprt.sphere import directions, harmonics, rotation
 from jaxprt.systems import protocol
 from jaxprt.systems.harmonic.exported import ExportedMatrices
@@ -113,24 +114,23 @@ class HarmonicSystem(protocol.VertexSystem):
         window = harmonics.least_laplacian(coefficient, self.laplacian)
         return transferred_light(self.transport, harmonics.convolve(coefficient, window))
 
-    def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> Float[Array, "lm d v"]:
-        """SH coefficients of the BRDF for each vertex's view."""
-        return blended_view(self.brdf, *self.place(self.transport), materials, eye=eye)
+    def view(
+        self, eye: Float[Array, "*p 3"], materials: Blend | None = None, points: Points = VERTICES
+    ) -> Float[Array, "lm d p"]:
+        """SH coefficients of the BRDF for each point's view."""
+        return blended_view(self.brdf, *self.placed(points), materials, eye=eye)
 
-    def combine(self, light: Float[Array, "lm c _"], view: Float[Array, "lm d v"]) -> Float[Array, "v e"]:
+    def combine(
+        self, light: Float[Array, "lm c _"], view: Float[Array, "lm d p"], points: Points = VERTICES
+    ) -> Float[Array, "p e"]:
         """Radiance: the dot product of light and BRDF coefficients."""
         require.array("the light", light, "lm c v", source="HarmonicSystem.light")
         require.array("the view", view, "lm c v", source="HarmonicSystem.view")
-        return combine(self.carried(light, axis=2), view)
+        return combine(points.carry(light, axis=2), view)
 
     def exported(self, what: str) -> ExportedMatrices:
         """Harmonics of the visibility, from which a page makes the matrices: `System.exported`."""
         return ExportedMatrices.of(what, self)
-
-    @property
-    def vertices(self) -> int:
-        """Number of vertices, or of points where radiance is evaluated at points."""
-        return len(self.transport.position if self.points is None else self.points)
 
 
 class TiltedLight(eqx.Module):
@@ -169,16 +169,20 @@ class DiffuseSystem(protocol.VertexSystem):
         """SH coefficients of the light, which may be given as such; see `HarmonicSystem.light`."""
         return _coefficients(environment, harmonics.degree_of(self.transport.vector.shape[0]))
 
-    def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> Float[Array, "_ d"]:
-        """Albedo of all vertices, or of each vertex with a blend. It does not depend on the eye."""
-        return protocol.albedo_view(self.albedo, eye, materials, vertices=self.vertices)
+    def view(
+        self, eye: Float[Array, "*p 3"], materials: Blend | None = None, points: Points = VERTICES
+    ) -> Float[Array, "_ d"]:
+        """Albedo of all points, or of each point with a blend. It does not depend on the eye."""
+        return protocol.albedo_view(self, eye, materials, points)
 
     def tilted(self, light: Float[Array, "lm c *w"], normal: Float[Array, "v 3"]) -> TiltedLight:
         """The light with the normals of the vertices: `System.tilted`."""
         return TiltedLight(light, normal)
 
     @promoted
-    def combine(self, light: Float[Array, "lm c *w"] | TiltedLight, view: Float[Array, "_ d"]) -> Float[Array, "v e"]:
+    def combine(
+        self, light: Float[Array, "lm c *w"] | TiltedLight, view: Float[Array, "_ d"], points: Points = VERTICES
+    ) -> Float[Array, "p e"]:
         """Radiance: the dot product of light and transfer vectors, times the albedo.
 
         At points with tilted normals it changes by the ratio by which it would change without shadows.
@@ -186,12 +190,12 @@ class DiffuseSystem(protocol.VertexSystem):
         coefficient = light.coefficient if isinstance(light, TiltedLight) else light
         require.array("the light", coefficient, "lm c", "lm c v", source="DiffuseSystem.light")
         require.array("the view", view, "v c", source="DiffuseSystem.view")
-        color = self.carried(combine(coefficient, self.transport.vector)) * view
-        if not isinstance(light, TiltedLight) or self.points is None or self.points.normal is None:
+        color = points.carry(combine(coefficient, self.transport.vector)) * view
+        if not isinstance(light, TiltedLight) or points.normal is None:
             return color
-        smooth = directions.normalize(self.points.carry(light.normal))
-        there = coefficient if coefficient.ndim == 2 else self.carried(coefficient, axis=2)
-        return color * tilted_share(*(_unshadowed(there, normal) for normal in (smooth, self.points.normal.T)))
+        smooth = directions.normalize(points.carry(light.normal))
+        there = coefficient if coefficient.ndim == 2 else points.carry(coefficient, axis=2)
+        return color * tilted_share(*(_unshadowed(there, normal) for normal in (smooth, points.normal.T)))
 
     def exported(self, what: str) -> protocol.Exported:
         """The transfer vectors: `System.exported`."""
@@ -204,11 +208,6 @@ class DiffuseSystem(protocol.VertexSystem):
     def matte(self) -> bool:
         """True: surfaces are ideally diffuse."""
         return True
-
-    @property
-    def vertices(self) -> int:
-        """Number of vertices, or of points where radiance is evaluated at points."""
-        return len(self.transport.position if self.points is None else self.points)
 
     @property
     def shared_light(self) -> tuple:

@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 from jaxprt import require
 from jaxprt.brdf.models import color
 from jaxprt.compile import jit
-from jaxprt.scene.points import Points, placed
+from jaxprt.scene.points import VERTICES, Points, placed
 from jaxprt.sphere import directions
 from jaxprt.systems.lamps.transport import LampTransport
 from jaxprt.systems.lobe import LobeBrdf
@@ -67,17 +67,17 @@ class LitByLamps(eqx.Module):
         self,
         eye: Float[Array, "*p 3"],
         blend: Blend | None = None,
-        points: Points | None = None,
-        traced: Float[Array, " _"] | None = None,
-    ) -> Float[Array, "n v c"]:
+        points: Points = VERTICES,
+        traced: Float[Array, " p"] | None = None,
+    ) -> Float[Array, "n p c"]:
         """Radiance that each vertex or point sends to the eye, per lamp, for lamps of radiance 1.
 
         Args:
-            eye: Position of the viewer in world units: one, or one for each vertex or point.
-            blend: Weights of the BRDF's channels at each vertex or point; without a BRDF, the albedo of each. None for
-                `brdf` or `albedo` as they are.
-            points: Points at which radiance is evaluated; None for the vertices.
-            traced: Share of the narrow lobes of each vertex or point that is traced by rays; None for zero.
+            eye: Position of the viewer in world units: one, or one for each point.
+            blend: Weights of the BRDF's channels at each point; without a BRDF, the albedo of each. None for `brdf` or
+                `albedo` as they are.
+            points: Points at which radiance is evaluated; by default the vertices.
+            traced: Share of the narrow lobes of each point that is traced by rays; None for zero.
 
         Returns:
             Radiance per lamp n, vertex and color, to be multiplied by the radiance of each lamp. Differentiable in the
@@ -87,7 +87,7 @@ class LitByLamps(eqx.Module):
             TypeError: The blend is not a `Blend`.
             ValueError: The blend has another number of vertices or channels, or the eye is not finite.
         """
-        count = len(self.transport.position if points is None else points)
+        count = points.count(len(self.transport.position))
         eye = require.position("the eye", eye, points=count)
         check_blend(blend)
         if blend is not None:
@@ -102,7 +102,7 @@ class LitByLamps(eqx.Module):
         """
         return dataclasses.replace(self, transport=transport)
 
-    def chord(self, points: Points | None = None) -> Float[Array, "n _"]:
+    def chord(self, points: Points = VERTICES) -> Float[Array, "n _"]:
         """Squared chord, from center to rim, of the disk that approximates each lamp at each vertex or point."""
         return _chord(self.transport, points)
 
@@ -128,7 +128,7 @@ def combine(radiance: Float[Array, "n d"], view: Float[Array, "n v c"]) -> Float
 
 @jit
 def _view(
-    lit: LitByLamps, eye: Array, blend: Blend | None, points: Points | None, traced: Array | None
+    lit: LitByLamps, eye: Array, blend: Blend | None, points: Points, traced: Array | None
 ) -> Float[Array, "n v c"]:
     transport = lit.transport
     solid, cosine, way = _integrals(transport, points)
@@ -148,20 +148,19 @@ def _view(
     return jnp.einsum("nkv,vkc->nvc", value, blend.weight, precision="highest")
 
 
-def _integrals(transport: LampTransport, points: Points | None) -> tuple[Array, Array, Array]:
-    """The transport's integrals at the vertices, or interpolated to points."""
-    solid, cosine, way = transport.solid_angle, transport.cosine, transport.direction
-    if points is not None:
-        solid, cosine, way = (points.carry(row, axis=-1) for row in (solid, cosine, way))
-        if points.normal is not None:
-            # The integral of direction gives that of the cosine with the tilted normal.
-            tilt = points.normal - points.tilted(None).frame(transport.frame)[:, 2].T
-            cosine = jnp.maximum(cosine + jnp.sum(way * tilt, -2), 0)
+def _integrals(transport: LampTransport, points: Points) -> tuple[Array, Array, Array]:
+    """The transport's integrals, interpolated to points."""
+    rows = transport.solid_angle, transport.cosine, transport.direction
+    solid, cosine, way = (points.carry(row, axis=-1) for row in rows)
+    if points.normal is not None:
+        # The integral of direction gives that of the cosine with the tilted normal.
+        tilt = points.normal - points.tilted(None).frame(transport.frame)[:, 2].T
+        cosine = jnp.maximum(cosine + jnp.sum(way * tilt, -2), 0)
     return solid, cosine, way
 
 
 @jit
-def _chord(transport: LampTransport, points: Points | None) -> Float[Array, "n v"]:
+def _chord(transport: LampTransport, points: Points) -> Float[Array, "n v"]:
     solid, _, way = _integrals(transport, points)
     numbers = np.asarray(transport.lamp)
     whole, moment = (

@@ -103,14 +103,12 @@ def flux(
 
 
 def at_points(
-    irradiance: Float[Array, "c v"], flux: Float[Array, "c 3 v"] | None, points: Points | None
+    irradiance: Float[Array, "c v"], flux: Float[Array, "c 3 v"] | None, points: Points
 ) -> Float[Array, "c _"]:
-    """Irradiance / pi at points, from `irradiance` and `flux` at the vertices; at the vertices if `points` is None.
+    """Irradiance / pi at points, from `irradiance` and `flux` at the vertices.
 
     Points with tilted normals have that of their normals if there is a flux.
     """
-    if points is None:
-        return irradiance
     if points.normal is None or flux is None:
         return points.carry(irradiance, axis=1)
     return jnp.sum(points.carry(flux, axis=2) * points.normal, 1)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
+from jaxprt.scene.points import VERTICES
 from jaxprt.systems.lobe import pyramid
 from jaxprt.systems.lobe.pyramid import LobeTransport, Scales
 from jaxprt.systems.lobe.table import LobeBrdf
@@ -31,7 +32,7 @@ class CoarseTransport(LobeTransport):
     edge: int = eqx.field(static=True)
     spread: float = eqx.field(static=True)
 
-    def lobe_visibility(self, face, s, t, spread, points=None):
+    def lobe_visibility(self, face, s, t, spread, points=VERTICES):
         """Visible fraction of each vertex's lobes, from the remaining scales."""
         none = jnp.zeros((0, len(self.position)), jnp.uint8)
         whole = LobeTransport(self.pyramid, none, self.position, self.frame, self.edge)

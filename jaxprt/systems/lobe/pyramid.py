@@ -20,7 +20,7 @@ from jaxprt import require, visibility
 from jaxprt.compile import isolated, jit
 from jaxprt.files.arrays import Layout
 from jaxprt.scene.mesh import Mesh
-from jaxprt.scene.points import Points
+from jaxprt.scene.points import VERTICES, Points
 from jaxprt.sphere import cubemap, haar
 from jaxprt.systems.lobe import diffuse
 from jaxprt.visibility import StoredVisibility
@@ -80,7 +80,7 @@ class LobeTransport(eqx.Module):
         s: Float[Array, "l v"],
         t: Float[Array, "l v"],
         spread: Float[Array, "l v"],
-        points: Points | None = None,
+        points: Points = VERTICES,
     ) -> tuple[Float[Array, "l v"], Float[Array, "l v"], Float[Array, "l v"]]:
         """Mean visibility over each lobe of each vertex, horizon included, and its derivatives.
 
@@ -93,7 +93,7 @@ class LobeTransport(eqx.Module):
             s: Column coordinate of the direction on the face, from -1 to 1.
             t: Row coordinate of the direction on the face, from -1 to 1.
             spread: Mean of 1 - cos of the angle to the lobe's direction, from `jaxprt.decompose.mixture.drop`.
-            points: Points that the lobes belong to; None for the vertices.
+            points: Points that the lobes belong to.
 
         Returns:
             Mean visibility of each lobe, from 0 to 1, and its derivatives with respect to s and t.
@@ -103,9 +103,8 @@ class LobeTransport(eqx.Module):
         count = face.shape[1]
         face, s, t, spread = (_blocks(array) for array in (face, s, t, spread))
         down, right, bit = _addresses(face, s, t, spread, size=self.size)
-        corners = (np.arange(count, dtype=np.int32),) if points is None else points.corner
-        read = tuple(_bytes(self.pyramid, _blocks(corner[None]), down, right) for corner in corners)
-        weight = None if points is None else _blocks(points.weight.astype(spread.dtype))
+        read = tuple(_bytes(self.pyramid, _blocks(row[None]), down, right) for row in points.corners(count))
+        weight = None if points.weight is None else _blocks(points.weight.astype(spread.dtype))
         seen, by_s, by_t = _decode(read, weight, bit, s, t, spread, size=self.size)
         return _columns(seen, count), _columns(by_s, count), _columns(by_t, count)
 

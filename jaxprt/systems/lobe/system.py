@@ -21,7 +21,7 @@ from jaxprt import require
 from jaxprt.compile import isolated, jit, promoted, total
 from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
-from jaxprt.scene.points import Points, placed
+from jaxprt.scene.points import VERTICES, Points, placed
 from jaxprt.sphere import cubemap, directions
 from jaxprt.systems import harmonic, protocol
 from jaxprt.systems.lobe import diffuse
@@ -46,7 +46,7 @@ class LobeView(eqx.Module):
         weight: Weight of each lobe, gray or per color.
         diffuse: Albedo of the diffuse part, gray or per color.
         vector: Transfer vectors of the vertices, for the diffuse part; no rows if the light holds the irradiance.
-        points: Points that the view belongs to; None for the vertices.
+        points: Points that the view belongs to.
         size: Edge of the environment's cubemap faces in texels.
     """
 
@@ -55,7 +55,7 @@ class LobeView(eqx.Module):
     weight: Float[Array, "c l v"]
     diffuse: Float[Array, "c v"]
     vector: UInt8[Array, "h _"] | Float[Array, "h _"]
-    points: Points | None
+    points: Points
     size: int = eqx.field(static=True)
 
 
@@ -100,19 +100,21 @@ class LobeSystem(protocol.VertexSystem):
         self,
         eye: Float[Array, "*p 3"],
         materials: Blend | None = None,
-        variance: Float[Array, " v"] | None = None,
+        points: Points = VERTICES,
+        *,
+        variance: Float[Array, " p"] | None = None,
     ) -> LobeView:
-        """Texels at which each vertex reads the blurred light, with visibility.
+        """Texels at which each point reads the blurred light, with visibility.
 
-        `variance`, in squared radians, widens the lobes of each vertex or point.
+        `variance`, in squared radians, widens the lobes of each point.
         """
         protocol.check_blend(materials)
-        options = {"eye": eye, "points": self.points, "variance": variance}
+        options = {"eye": eye, "points": points, "variance": variance}
         # The irradiance comes with the light: each row of points would hold a copy of the vectors.
         transport = eqx.tree_at(lambda stored: stored.vector, self.transport, self.transport.vector[:0])
         if materials is None:
             return view_lobes(transport, self.brdf, **options)
-        materials.check(self.vertices, len(self.brdf.weight))
+        materials.check(points.count(self.vertices), len(self.brdf.weight))
         seen = view_lobes(transport, self.brdf, *materials.parameter, **options)
         # Channel by channel with the vertices last: an einsum would be a small matrix product for each vertex.
         channel = jnp.moveaxis(materials.weight, 0, 2)
@@ -121,8 +123,8 @@ class LobeSystem(protocol.VertexSystem):
         diffuse = reduce(jnp.add, (albedo * part for _, albedo, part in pairs))
         return eqx.tree_at(lambda looked: (looked.weight, looked.diffuse), seen, (weight, diffuse))
 
-    def combine(self, light: LobeLight, view: LobeView) -> Float[Array, "v c"]:
-        """Radiance: the blurred light, read at the texels of the view and weighted."""
+    def combine(self, light: LobeLight, view: LobeView, points: Points = VERTICES) -> Float[Array, "p c"]:
+        """Radiance: the blurred light, read at the texels of the view, which has its points, and weighted."""
         require.kind("the light", light, LobeLight, source="LobeSystem.light")
         require.kind("the view", view, LobeView, source="LobeSystem.view")
         if light.irradiance is None:
@@ -153,11 +155,6 @@ class LobeSystem(protocol.VertexSystem):
         return self
 
     @property
-    def vertices(self) -> int:
-        """Number of vertices, or of points where radiance is evaluated at points."""
-        return len(self.transport.position if self.points is None else self.points)
-
-    @property
     def shared_light(self) -> tuple:
         """Key of the light, which depends on the environment and its size only."""
         return LobeSystem, self.transport.size
@@ -176,9 +173,9 @@ class CoarseLobes(LobeSystem):
         """The light as it is: what arrives at tilted normals changes as it would without shadows, in `combine`."""
         return light
 
-    def combine(self, light: LobeLight, view: LobeView) -> Float[Array, "v c"]:
+    def combine(self, light: LobeLight, view: LobeView, points: Points = VERTICES) -> Float[Array, "p c"]:
         """Radiance: `LobeSystem.combine`."""
-        if view.points is None or view.points.normal is None:
+        if view.points.normal is None:
             return super().combine(light, view)
         smooth = view.points.tilted(None).frame(self.transport.frame)[:, 2]
         before, after = (_upon(light, normal) for normal in (smooth.T, view.points.normal))
@@ -196,21 +193,23 @@ def view_lobes(
     brdf: LobeBrdf,
     *parameter: Float[Array, " v"],
     eye: Float[Array, "*p 3"],
-    points: Points | None = None,
-    variance: Float[Array, " v"] | None = None,
+    points: Points = VERTICES,
+    variance: Float[Array, " p"] | None = None,
 ) -> LobeView:
     """Finds the texels of the blurred light that each vertex or point reads for a view, and their visibility.
 
     Args:
         transport: Visibility pyramids, from `precompute`.
         brdf: Table of lobes, from `tabulate`.
-        parameter: Values of each BRDF parameter at the vertices or points, if the table has parameters.
-        eye: Position of the viewer in world units: one, or one for each vertex or point.
-        points: Points at which radiance is evaluated; None for the vertices.
-        variance: Variance in squared radians, along one axis, by which the lobes of each vertex or point are widened;
-            None for zero.
+        parameter: Values of each BRDF parameter at the points, if the table has parameters.
+        eye: Position of the viewer in world units: one, or one for each point.
+        points: Points at which radiance is evaluated; by default the vertices.
+        variance: Variance in squared radians, along one axis, by which the lobes of each point are widened; None for
+            zero.
     """
-    eye = require.position("the eye", eye, points=len(transport.position if points is None else points))
+    count = len(transport.position)
+    protocol.check_points(points, count)
+    eye = require.position("the eye", eye, points=points.count(count))
     return _view_lobes(transport, brdf, parameter, eye, points, variance)
 
 
@@ -220,7 +219,7 @@ def _view_lobes(
     brdf: LobeBrdf,
     parameter: tuple[Array, ...],
     eye: Array,
-    points: Points | None,
+    points: Points,
     variance: Array | None,
 ) -> LobeView:
     placing = *placed(transport.position, transport.frame, points), brdf, eye, variance
@@ -397,12 +396,14 @@ class MatteSystem(protocol.VertexSystem):
         flux = diffuse.flux(light.coefficient, self.transport.vector, normal, size=self.transport.size)
         return dataclasses.replace(light, flux=flux)
 
-    def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> Float[Array, "_ d"]:
-        """Albedo of all vertices, or of each vertex with a blend. It does not depend on the eye."""
-        return protocol.albedo_view(self.albedo, eye, materials, vertices=self.vertices)
+    def view(
+        self, eye: Float[Array, "*p 3"], materials: Blend | None = None, points: Points = VERTICES
+    ) -> Float[Array, "_ d"]:
+        """Albedo of all points, or of each point with a blend. It does not depend on the eye."""
+        return protocol.albedo_view(self, eye, materials, points)
 
     @promoted
-    def combine(self, light: MatteLight, view: Float[Array, "_ d"]) -> Float[Array, "v e"]:
+    def combine(self, light: MatteLight, view: Float[Array, "_ d"], points: Points = VERTICES) -> Float[Array, "p e"]:
         """Radiance: irradiance / pi times the albedo."""
         require.kind("the light", light, MatteLight, source="MatteSystem.light")
         require.array("the view", view, "v c", source="MatteSystem.view")
@@ -410,7 +411,7 @@ class MatteSystem(protocol.VertexSystem):
         if irradiance is None:
             irradiance = diffuse.irradiance(light.coefficient, self.transport.vector)
         protocol.check_colors(len(irradiance), view.shape[1])
-        return diffuse.at_points(irradiance, light.flux, self.points).T * view
+        return diffuse.at_points(irradiance, light.flux, points).T * view
 
     def exported(self, what: str) -> protocol.Exported:
         """The transfer vectors in spherical harmonics: `System.exported`."""
@@ -422,11 +423,6 @@ class MatteSystem(protocol.VertexSystem):
     def matte(self) -> bool:
         """True: surfaces are ideally diffuse."""
         return True
-
-    @property
-    def vertices(self) -> int:
-        """Number of vertices, or of points where radiance is evaluated at points."""
-        return len(self.transport.position if self.points is None else self.points)
 
     @property
     def shared_light(self) -> tuple:

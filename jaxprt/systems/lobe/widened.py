@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxprt.compile import jit, total
+from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap, directions
 from jaxprt.systems.bright_texels import BrightLight, BrightTexels
 from jaxprt.systems.lobe.table import LobeMixture
@@ -40,39 +41,43 @@ def can_widen(system: System) -> bool:
 
 
 @jit
-def view(system: Any, eye: Float[Array, "*p 3"], blend: Blend | None, variance: Float[Array, " v"]) -> WidenedView:
+def view(
+    system: Any, eye: Float[Array, "*p 3"], blend: Blend | None, points: Points, variance: Float[Array, " p"]
+) -> WidenedView:
     """The view of a system with lobes, with or without bright texels, whose lobes are widened.
 
     Args:
-        system: The system, at vertices or points.
-        eye: Position of the viewer: one, or one for each vertex or point.
+        system: The system.
+        eye: Position of the viewer: one, or one for each point.
         blend: Weights and parameters of the channels; None for the BRDF as it is.
+        points: The points.
         variance: Variance in squared radians, along one axis, by which all lobes of a vertex or point are widened.
     """
     lobes = system.lobe_part
     inner: Any = system.system if isinstance(system, BrightTexels) else system
-    position, frame = lobes.place(lobes.transport)
+    position, frame = lobes.placed(points)
     lobe = lobes.brdf.lookup(directions.view(frame, position, eye), *(() if blend is None else blend.parameter))
-    rest = inner.view(eye, blend, variance)
+    rest = inner.view(eye, blend, points, variance=variance)
     looked = rest if inner is lobes else rest.lobes
     lobe = LobeMixture(lobe.mean, lobe.concentration, looked.weight, looked.diffuse).widened(variance)
     return WidenedView(rest, lobe, frame)
 
 
 @jit
-def combine(system: Any, light: PyTree, seen: WidenedView) -> Float[Array, "v c"]:
+def combine(system: Any, light: PyTree, seen: WidenedView, points: Points) -> Float[Array, "p c"]:
     """Radiance: the blurred light, read by the widened lobes, and the brightest texels, each times the same lobes.
 
     Args:
         system: The system of the view.
         light: The result of its `shade`.
         seen: The result of `view`.
+        points: The points of the view.
     """
     if not isinstance(light, BrightLight):
-        return system.combine(light, seen.rest)
+        return system.combine(light, seen.rest, points)
     assert isinstance(system, BrightTexels)
     assert light.seen is not None
-    size, points = system.visibility.size, system.points
+    size = system.visibility.size
     direction, area = (
         quantity(size=size).reshape(-1, 3)[light.texel] for quantity in (cubemap.direction, cubemap.vector_area)
     )
@@ -82,10 +87,9 @@ def combine(system: Any, light: PyTree, seen: WidenedView) -> Float[Array, "v c"
 
     def lit(texel: tuple[Array, Array, Array, Array]) -> Float[Array, "c v"]:
         direction, area, excess, visible = texel
-        share = visible.astype(frame.dtype) / LEVELS
-        share = share if points is None else points.carry(share)
+        share = points.carry(visible.astype(frame.dtype) / LEVELS)
         wi = jnp.sum(frame * direction[:, None], 1).T
         return lobe.evaluate(wi) * jnp.linalg.norm(area) * share * excess[:, None]
 
     sent = total(lit, (direction.astype(frame.dtype), area.astype(frame.dtype), light.excess, light.seen)).T
-    return system.system.combine(light.rest, seen.rest) + sent
+    return system.system.combine(light.rest, seen.rest, points) + sent

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from jaxprt import require
 from jaxprt.compile import isolated, jit, linear
 from jaxprt.scene.environment import Environment
+from jaxprt.scene.points import VERTICES, Points
 from jaxprt.sphere import directions, haar
 from jaxprt.systems import protocol
 from jaxprt.systems.protocol import Blend
@@ -71,30 +72,29 @@ class SeparableSystem(protocol.VertexSystem):
         """The light-modulated tuple of every vertex."""
         return light_tuple(self.transport, environment)
 
-    def view(self, eye: Float[Array, "*p 3"], materials: Blend | None = None) -> Float[Array, "v r d"]:
-        """The view-modulated tuple of every vertex."""
+    def view(
+        self, eye: Float[Array, "*p 3"], materials: Blend | None = None, points: Points = VERTICES
+    ) -> Float[Array, "p r d"]:
+        """The view-modulated tuple of every point."""
         protocol.check_blend(materials)
-        factor = view_tuple(self.brdf, *self.place(self.transport), eye)
+        factor = view_tuple(self.brdf, *self.placed(points), eye)
         if materials is None:
             return factor
-        materials.check(self.vertices, self.brdf.view_map.shape[-1])
+        materials.check(len(factor), self.brdf.view_map.shape[-1])
         return jnp.einsum("vrk,vkc->vrc", factor, materials.weight, precision="highest")
 
-    def combine(self, light: Float[Array, "_ r c"], view: Float[Array, "v r d"]) -> Float[Array, "v e"]:
+    def combine(
+        self, light: Float[Array, "_ r c"], view: Float[Array, "p r d"], points: Points = VERTICES
+    ) -> Float[Array, "p e"]:
         """Radiance: the dot product of the two tuples."""
         require.array("the light", light, "v r c", source="SeparableSystem.light")
         require.array("the view", view, "v r c", source="SeparableSystem.view")
-        return combine(self.carried(light), view)
+        return combine(points.carry(light), view)
 
     @property
     def light_size(self) -> int:
         """Edge of the faces of the light, whose coefficients the transport has."""
         return haar.face_edge(self.transport.rms.shape[0])
-
-    @property
-    def vertices(self) -> int:
-        """Number of vertices, or of points where radiance is evaluated at points."""
-        return len(self.transport.position if self.points is None else self.points)
 
 
 @require.arguments(light=protocol.one_light)

@@ -10,7 +10,7 @@ import jaxprt as prt
 from jaxprt import bright_texels, dynamic, visibility
 from jaxprt.brdf import MetallicRoughness
 from jaxprt.scene import Environment, builtin
-from jaxprt.scene.points import Points
+from jaxprt.scene.points import VERTICES, Points
 from jaxprt.systems.lobe import widened
 from jaxprt.systems.protocol import Blend
 from jaxprt.systems.standard import METALLIC_ROUGHNESS
@@ -111,8 +111,7 @@ def test_points_with_a_tilted_normal_reflect_around_it(seen, system):
     straight = points.tilted(np.asarray(seen.frame[:, 2]))
     lit = dynamic_system.shade(dynamic_system.light(sky))
     tilted = dynamic_system.tilted(lit, jnp.asarray(seen.frame[:, 2]))
-    same = dynamic_system.at(straight)
-    found = same.combine(tilted, same.view(EYE, blend))
+    found = dynamic_system.combine(tilted, dynamic_system.view(EYE, blend, straight), straight)
     np.testing.assert_allclose(
         found, dynamic_system.combine(lit, dynamic_system.view(EYE, blend)), rtol=2e-3, atol=2e-3
     )
@@ -129,8 +128,8 @@ def test_rays_read_its_lobes_widened_and_its_terms_as_they_are(seen, light, syst
 
     def read(of, environment, variance):
         lit = of.shade(of.light(environment))
-        view = widened.view(of, EYE, blend, jnp.full(len(seen.position), variance))
-        return np.asarray(widened.combine(of, lit, view))
+        view = widened.view(of, EYE, blend, VERTICES, jnp.full(len(seen.position), variance))
+        return np.asarray(widened.combine(of, lit, view, VERTICES))
 
     assert widened.can_widen(whole)
     plain = prt.radiance(dynamic_system, light, eye=EYE, materials=blend)

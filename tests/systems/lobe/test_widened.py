@@ -9,7 +9,7 @@ from jaxprt import bright_texels, lobe, total, visibility
 from jaxprt.brdf import CookTorrance
 from jaxprt.scene import Environment, builtin
 from jaxprt.scene.mesh import ground_plane, join
-from jaxprt.scene.points import Points
+from jaxprt.scene.points import VERTICES, Points
 from jaxprt.systems.lobe import widened
 from jaxprt.systems.lobe.table import LobeMixture
 
@@ -44,10 +44,9 @@ def both(seen, brdf):
     return plain, bright_texels.BrightTexels(plain, seen, brdf, count=8, samples=2)
 
 
-def lit(system, light, variance):
-    count = len(system.points) if system.points is not None else system.vertices
-    seen = widened.view(system, EYE, None, jnp.full(count, variance))
-    return np.asarray(widened.combine(system, system.shade(system.light(light)), seen))
+def lit(system, light, variance, points=VERTICES):
+    seen = widened.view(system, EYE, None, points, jnp.full(points.count(system.vertices), variance))
+    return np.asarray(widened.combine(system, system.shade(system.light(light)), seen, points))
 
 
 def test_a_widened_lobe_is_the_mean_over_directions():
@@ -87,8 +86,8 @@ def test_points_have_what_vertices_have(mesh, systems, close):
     system, light = systems[1], builtin.daylight(size=SIZE)
     corner = mesh.face[::7].T
     weight = jnp.zeros(corner.shape).at[0].set(1)
-    at = system.at(Points(corner, weight, jnp.zeros((2, *corner.shape))))
-    close(lit(at, light, 0.1), lit(system, light, 0.1)[np.asarray(corner[0])], tolerance=1e-4)
+    points = Points(corner, weight, jnp.zeros((2, *corner.shape)))
+    close(lit(system, light, 0.1, points), lit(system, light, 0.1)[np.asarray(corner[0])], tolerance=1e-4)
 
 
 def test_only_systems_with_lobes_can_be_widened(systems):
