@@ -167,6 +167,6 @@ def png_chunk(kind, data):
 def test_png_files_with_right_checksums_of_wrong_content_are_refused_without_a_line_of_libpng(capfd, chunks, words):
     header = (b"IHDR", struct.pack(">2I5B", 4, 4, 8, 2, 0, 0, 0))
     content = b"\x89PNG\r\n\x1a\n" + b"".join(png_chunk(*each) for each in (header, *chunks, (b"IEND", b"")))
-    with pytest.raises(ValueError, match=rf"a\.png must be an undamaged png file, got {words}"):
+    with pytest.raises(ValueError, match=rf"a\.png must be an undamaged png file, got: {words}"):
         decode_image(content, name="a.png")
     assert capfd.readouterr().err == ""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.files import outputs, read_image, write_exr, write_png
+from jaxprt.files import outputs, pixels, read_image, write_exr, write_png
 
 
 def test_the_new_file_replaces_the_old_one_at_the_end(tmp_path):
@@ -255,7 +255,7 @@ def test_directories_pipes_and_devices_are_not_replaced(tmp_path, write, suffix)
 
 
 def test_what_is_not_finite_and_large_images_are_written_in_blocks(tmp_path, monkeypatch):
-    monkeypatch.setattr(outputs, "_BLOCK", 1)
+    monkeypatch.setattr(pixels, "_VALUES", 1)
     image = random_image(50, 20, 3)
     image[3, 4], image[40, 2] = [np.nan, np.inf, -np.inf], [-1.0, 1e38, 1e-40]
     write_exr(tmp_path / "image.exr", image)
