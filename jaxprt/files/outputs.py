@@ -1,10 +1,12 @@
 """Output files: written beside the old file, checked, and renamed, so that a failure leaves the old file as it was."""
 
 import contextlib
+import errno
 import os
 import pathlib
 import re
 import secrets
+import shutil
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -79,6 +81,29 @@ def replacing(path: str | os.PathLike) -> Iterator[pathlib.Path]:
         raise _name_error(path, error) from error
     finally:
         new.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def new_folder(path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """A new folder beside `path`, which gets this name when the block ends: no process sees an incomplete one.
+
+    Args:
+        path: The folder, which must not exist yet. Missing parents are created.
+
+    Yields:
+        Path of the new folder. It is removed after an error.
+    """
+    new = path.with_name(f".{secrets.token_hex(8)}.new")
+    try:
+        new.mkdir(parents=True)
+        yield new
+        if path.exists():  # An empty folder would be replaced.
+            raise FileExistsError(errno.EEXIST, "it exists; remove it or name another path")
+        new.rename(path)
+    except OSError as error:
+        raise _name_error(path, error) from error
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
 
 
 def write(path: str | os.PathLike, content: bytes | str) -> None:

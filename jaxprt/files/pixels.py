@@ -43,13 +43,7 @@ _SRGB_HALF = ((0.5 + 0.055) / 1.055) ** 2.4
 
 
 def check_size(name: str | pathlib.Path, height: int, width: int) -> None:
-    """Refuses images without pixels, and with too many.
-
-    Args:
-        name: The image, for the message.
-        height: Rows that the header states.
-        width: Columns that the header states.
-    """
+    """Refuses images that have no pixels, or too many by their header."""
     if height < 1 or width < 1 or height * width > MAX_PIXELS:
         raise ValueError(
             f"{name} must have 1 to {MAX_PIXELS} pixels, got {width} x {height} (width x height): reduce its size in "
@@ -58,15 +52,7 @@ def check_size(name: str | pathlib.Path, height: int, width: int) -> None:
 
 
 def check_memory(name: str | pathlib.Path, height: int, width: int, channels: int, *, decoder: int) -> None:
-    """Refuses images that do not fit into memory, before any pixel is read.
-
-    Args:
-        name: The image, for the message.
-        height: Rows.
-        width: Columns.
-        channels: Channels that are read, as float32.
-        decoder: Bytes that the decoder allocates besides.
-    """
+    """Refuses images that do not fit into memory as float32, beside the bytes that their decoder allocates."""
     require.memory(
         f"{name}: {width} x {height} pixels (width x height) of {channels} channels",
         4 * height * width * channels + decoder + _BLOCKS,
@@ -75,14 +61,7 @@ def check_memory(name: str | pathlib.Path, height: int, width: int, channels: in
 
 
 def row_blocks(image: np.ndarray) -> Iterator[np.ndarray]:
-    """Blocks of rows of an image, which are views of it. Between two blocks Ctrl-C takes effect.
-
-    Args:
-        image: Pixels [h, w, c].
-
-    Yields:
-        Consecutive rows.
-    """
+    """Blocks of rows of an image, which are views of it. Between two blocks Ctrl-C takes effect."""
     step = max(1, _VALUES // (image.shape[1] * image.shape[2]))
     for first in range(0, len(image), step):
         yield image[first : first + step]
@@ -211,11 +190,7 @@ def upright(image: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def decode_srgb(image: np.ndarray) -> None:
-    """Decodes sRGB values to linear ones in place (IEC 61966-2-1).
-
-    Args:
-        image: Encoded values [h, w, c] of 0 to 1.
-    """
+    """Decodes sRGB values [h, w, c] of 0 to 1 to linear ones in place (IEC 61966-2-1)."""
     for rows in row_blocks(image):
         rows[...] = srgb_to_linear(rows)
 
@@ -252,12 +227,7 @@ def to_rec709(chromaticities: Sequence[float], name: str) -> Float64[np.ndarray,
 
 
 def convert(image: np.ndarray, matrix: np.ndarray) -> None:
-    """Multiplies the first three channels by a matrix, in place.
-
-    Args:
-        image: Pixels [h, w, c] with at least three channels.
-        matrix: The matrix, for colors in columns.
-    """
+    """Multiplies the first three channels of pixels [h, w, c] by a matrix, for colors in columns, in place."""
     with np.errstate(invalid="ignore", over="ignore"):  # An infinite channel may become NaN; neither is hidden.
         for rows in row_blocks(image):
             rows[..., :3] = rows[..., :3] @ matrix.T.astype(np.float32)
