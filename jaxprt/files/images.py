@@ -190,23 +190,23 @@ def _read_exr(path: pathlib.Path, name: str) -> tuple[Float32[np.ndarray, "h w c
 
 def _color_part(parts: list[Any], name: str) -> tuple[int, tuple[str, ...]]:
     """Index and color channels of the first part with RGB, or else with Y."""
-    found = []
+    usable = []
     for index, spec in enumerate(parts):
         channels = next((names for names in _CHANNELS if set(names) <= set(spec.channelnames)), None)
         if channels is not None and not spec.deep:
-            found.append((index, channels))
-    found = [part for part in found if "R" in part[1]] or found
+            usable.append((index, channels))
+    usable = [part for part in usable if "R" in part[1]] or usable
     names = sorted({channel for spec in parts for channel in spec.channelnames})
     must = f"{name} must have channels R, G, B or Y and perhaps A, got"
-    if not found:
+    if not usable:
         if all(spec.deep for spec in parts):
             raise ValueError(f"{name} must be an EXR image of scan lines or tiles, got one of deep pixels")
         layers = sorted({channel.rpartition(".")[0] for channel in names if "." in channel})
         hint = f": only the layers {', '.join(layers)} have colors; write one of them without its prefix"
         raise ValueError(f"{must} {', '.join(names)}{hint if layers else ''}")
-    (index, channels), *others = found
+    (index, channels), *others = usable
     if others:
-        title, *ignored = (repr(str(_attributes(parts[k]).get("name", k))) for k, _ in found)
+        title, *ignored = (repr(str(_attributes(parts[k]).get("name", k))) for k, _ in usable)
         words = f"{name} has colors in several parts: {title} is used, {', '.join(ignored)} ignored"
         warnings.warn(words, stacklevel=6)
     used = set(parts[index].channelnames)
@@ -226,10 +226,7 @@ def _exr_matrix(attributes: dict[str, Any], name: str) -> np.ndarray | None:
 
 
 def _read_radiance(content: bytes, name: str) -> tuple[Float32[np.ndarray, "h w 3"], dict[str, Any]]:
-    """Radiance in linear Rec. 709, the right way up, and the variables of the header.
-
-    Pixels are divided by all exposures and color corrections. "EXPOSURE" is the product of all exposures.
-    """
+    """Radiance in linear Rec. 709, the right way up, and the variables of the header."""
     head, *rest = re.split(rb"\n\r?\n", content[:_LONGEST], maxsplit=1)
     line = _RESOLUTION.match(rest[0]) if rest else None
     orientation = _ORIENTATION.get(line[1] + line[3]) if line else None
