@@ -234,6 +234,8 @@ def _write(path: pathlib.Path, values: np.ndarray, names: Sequence[str], attribu
         spec.attribute(name, value)
     with replacing(path) as new:
         output = OpenImageIO.ImageOutput.create(str(new))
+        if output is None:
+            raise OSError(OpenImageIO.geterror())
         # Encoders do not report every full disk, so their word alone does not count.
         if not (output.open(str(new), spec) and output.write_image(np.ascontiguousarray(values)) and output.close()):
             raise OSError(output.geterror().replace(str(new), os.fspath(path)) or "the encoder failed")
