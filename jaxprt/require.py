@@ -1,5 +1,8 @@
 """Checks of arguments at the package's interface. Errors state what was required and what was given.
 
+The `name` of a value is its description for messages, such as "the eye", and the `source` of an object the name of the
+function that makes such objects.
+
 Values inside `jax.jit`, `jax.vmap` or `jax.grad` are not known while Python runs, so these checks let them pass. A NaN
 then reaches every vertex that depends on it.
 """
@@ -109,10 +112,6 @@ def finite(name: str, value: Any) -> None:
     """Refuses anything but real numbers, and refuses NaN, infinity and numbers above 1e32 in magnitude.
 
     Sums of products of larger numbers overflow in float32, and differences of infinities are NaN.
-
-    Args:
-        name: Description of the value for the message, such as "the eye".
-        value: A number or an array.
     """
     real(name, value)
     known = _array_of(value)
@@ -123,8 +122,8 @@ def finite(name: str, value: Any) -> None:
         known = known.astype(np.float64)
     if np.all(np.abs(known) <= LARGEST):  # false for NaN
         return
-    _require(name, "finite", known, np.asarray(np.isfinite(known)))
-    _require(name, f"at most {LARGEST:g} in magnitude", known, np.asarray(np.abs(known) <= LARGEST))
+    _require(name, "finite", known, np.isfinite)
+    _require(name, f"at most {LARGEST:g} in magnitude", known, lambda known: np.abs(known) <= LARGEST)
 
 
 def at_least(name: str, value: Any, least: float, *, slack: float = 0.0) -> None:
@@ -133,17 +132,35 @@ def at_least(name: str, value: Any, least: float, *, slack: float = 0.0) -> None
     `slack` is a tolerance for rounding errors.
     """
     finite(name, value)
+    _require(name, f"at least {least:g}", value, lambda known: known >= least - slack)
+
+
+def within(name: str, value: Any, low: int, high: int) -> None:
+    """Refuses arrays with integers outside a range."""
+    real(name, value)
+    _require(name, f"between {low} and {high}", value, lambda known: (known >= low) & (known <= high))
+
+
+def _require(name: str, what: str, value: Any, fits: Callable[[np.ndarray], Any]) -> None:
+    """Refuses numbers of which some do not fit, unless JAX traces them."""
     known = _array_of(value)
-    if not isinstance(known, Tracer):
-        known = np.asarray(known)
-        _require(name, f"at least {least:g}", known, np.asarray(known >= least - slack))
+    if isinstance(known, Tracer):
+        return
+    known = np.asarray(known)
+    wrong = np.argwhere(~np.asarray(fits(known)))
+    if not len(wrong):
+        return
+    where = f", first at {tuple(map(int, wrong[0]))}" if known.ndim else ""
+    raise ValueError(
+        f"{name} must be {what}, got {len(wrong)} of {known.size} values that are not{where}: {known[tuple(wrong[0])]}"
+    )
 
 
 def position(name: str, value: Any, *, points: int | None = None) -> Array:
     """Refuses values that are not a finite position. The shape is checked inside `jax.jit` too.
 
     Args:
-        name: Description of the value for the message, such as "the eye".
+        name: Description of the value.
         value: An array or a list.
         points: Number of points if the value may be one position for each point; None if it must be a single position.
 
@@ -241,58 +258,8 @@ def function(name: str, value: Any) -> None:
         raise TypeError(f"{name} must be a function or None, got {shown(value)}")
 
 
-def _require(name: str, what: str, known: np.ndarray, right: np.ndarray) -> None:
-    if right.all():
-        return
-    wrong = np.argwhere(~right)
-    where = f", first at {tuple(map(int, wrong[0]))}" if known.ndim else ""
-    raise ValueError(
-        f"{name} must be {what}, got {len(wrong)} of {known.size} values that are not{where}: {known[tuple(wrong[0])]}"
-    )
-
-
-def between(name: str, value: int | None, low: int, high: int) -> None:
-    """Refuses a number outside a range.
-
-    Args:
-        name: Description of the number for the message, such as "terms".
-        value: The number; None passes.
-        low: Smallest allowed value.
-        high: Largest allowed value.
-    """
-    if value is None:
-        return
-    real(name, value)
-    if np.ndim(_array_of(value)):
-        raise TypeError(f"{name} must be one number, got {_describe(value)}")
-    if not low <= value <= high:
-        raise ValueError(f"{name} must be between {low} and {high}, got {value}")
-
-
-def within(name: str, value: Any, low: int, high: int) -> None:
-    """Refuses arrays with integers outside a range.
-
-    Args:
-        name: Description of the numbers for the message, such as "the texels".
-        value: The array.
-        low: Smallest allowed value.
-        high: Largest allowed value.
-    """
-    real(name, value)
-    known = _array_of(value)
-    if not isinstance(known, Tracer):
-        known = np.asarray(known)
-        _require(name, f"between {low} and {high}", known, np.asarray((known >= low) & (known <= high)))
-
-
 def length(name: str, value: Any, count: int) -> None:
-    """Refuses an array with a wrong number of rows.
-
-    Args:
-        name: Description of the rows for the message, such as "the light's coefficients".
-        value: The array.
-        count: Required number of rows.
-    """
+    """Refuses an array with another number of rows, which have the name."""
     shape = np.shape(value)
     if not shape or shape[0] != count:
         raise ValueError(f"the number of {name} must be {count}, got {shape[0] if shape else 'one number'}")
@@ -355,31 +322,16 @@ def _host_memory() -> int | None:
 
 
 def kind(name: str, value: Any, *wanted: type, source: str) -> None:
-    """Refuses objects that are not of the wanted classes.
-
-    Args:
-        name: Description of the value for the message, such as "the light".
-        value: The object.
-        wanted: The allowed classes.
-        source: Name of the function that makes such an object, for the message.
-    """
+    """Refuses objects that are not of the wanted classes, by TypeError."""
     if not isinstance(value, wanted):
         names = " or ".join(kind.__name__ for kind in wanted)
         raise TypeError(f"{name} must be of class {names}, which {source} makes, got {_describe(value)}")
 
 
 def array(name: str, value: Any, *axes: str, source: str = "") -> None:
-    """Refuses values that are not arrays, or arrays of a wrong shape.
+    """Refuses anything but arrays (TypeError) of an allowed shape (ValueError).
 
-    Args:
-        name: Description of the value for the message, such as "the eye".
-        value: The array.
-        axes: Allowed shapes, such as "v 3". Letters stand for any size.
-        source: Name of the function that makes such an array, for the message; empty if there is none.
-
-    Raises:
-        TypeError: The value is not an array.
-        ValueError: The array has a wrong number of axes or a wrong size.
+    `axes` are the shapes, such as "v 3", in which letters stand for any size.
     """
     shape = value.shape if isinstance(value, jax.Array | np.ndarray) else None
     if shape is not None and any(_fits(shape, axis.split()) for axis in axes):

@@ -45,7 +45,6 @@ ONLY_IN = {
     "embreex": "jaxprt.visibility.occluder",
     "numba": ("jaxprt.visibility", "jaxprt.compile", "jaxprt.programs.loops"),
     "llvmlite": ("jaxprt.visibility.packets", "jaxprt.programs.loops"),
-    "OpenEXR": "jaxprt.files",
     "OpenImageIO": "jaxprt.files",
     "mmap": "jaxprt.files.arrays",
     "jaxopt": "jaxprt.inverse.solve",

@@ -129,7 +129,6 @@ HOST = {
     "systems.bounces.traced.quantiles": "a step of ReflectingPart; tests/systems/bounces/test_traced.py",
     "systems.bounces.traced.weights": "a step of ReflectingPart; tests/systems/bounces/test_traced.py",
     "systems.standard": "reads files, on the host; the rest fits what is in them",
-    "require.between": "checks a Python number",
     "require.finite": "checks values on the host",
     "require.length": "checks a shape",
     "visibility.members.cluster": "sorts on the host, where data enters",

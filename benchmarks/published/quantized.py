@@ -39,8 +39,8 @@ class QuantizedTransport(eqx.Module):
 
     def truncate(self, count: int, *, terms: int | None = None) -> "QuantizedTransport":
         """The transport with the first `count` coefficients, the largest ones, and `terms` terms (None: all)."""
-        require.between("count", count, 1, self.index.shape[0])
-        require.between("terms", terms, 1, self.terms)
+        require.count("count", count, least=1, most=self.index.shape[0])
+        require.count("terms", self.terms if terms is None else terms, least=1, most=self.terms)
         index, level, quantum = self.index[:count, :, :terms], self.level[:count, :, :terms], self.quantum[:, :terms]
         kept = QuantizedTransport(index, level, quantum, self.position, self.frame, self.rms)
         rms = sparse.rms(index, dequantize(kept).value, self.rms.shape[0])

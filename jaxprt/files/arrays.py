@@ -12,13 +12,11 @@ multiple of 64 bytes. On other devices it copies.
 """
 
 import contextlib
-import errno
 import functools
 import json
 import mmap
 import os
 import re
-import shutil
 import uuid
 import weakref
 import zlib
@@ -30,7 +28,7 @@ from typing import Any, BinaryIO, NamedTuple
 import filelock
 import numpy as np
 
-from jaxprt.files import inputs
+from jaxprt.files import inputs, outputs
 
 ALIGN = 64  # alignment in bytes at which JAX needs no copy; values in NumPy's format have it too
 _VERSION = (1, 0)
@@ -39,7 +37,6 @@ _FORMAT = "jaxprt blocks"
 _HEADER = "store.json"
 _CHECKSUM = "checksum"
 _PATIENCE = 2.0  # seconds to wait for another writer's check
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _SUMS = 32
 _PART = 1 << 20  # values per partial sum
 _MOST = 1e300  # largest number in a sketch
@@ -227,12 +224,8 @@ class BlockStore:
                 self._put(name, block, rows)
             self._put(_CHECKSUM, block, np.array(self._checksum(block, value), np.uint32))
         except OSError as error:
-            if error.errno not in _FULL:
-                raise
-            raise OSError(
-                error.errno,
-                f"{self.path} cannot grow ({error.strerror}); finished blocks are kept: call again to go on",
-            ) from error
+            words = f"{self.path} cannot grow ({error.strerror}); finished blocks are kept: call again to go on"
+            raise OSError(error.errno, words) from error
 
     def read(self, block: int) -> dict[str, np.ndarray] | None:
         """Reads one block of every array. Returns None if it was not written or its checksum is wrong."""
@@ -331,27 +324,26 @@ def _signs(count: int) -> np.ndarray:
 
 
 def _create(path: Path, header: Mapping[str, Any], files: Mapping[str, tuple[tuple[int, ...], str]]) -> None:
-    """Creates an empty store beside its path and renames it, so that no process sees an incomplete store."""
-    aside = path.with_name(f"{path.name}.{uuid.uuid4().hex}.new")  # process ids are not unique across machines
+    """Creates an empty store."""
     try:
-        aside.mkdir(parents=True)
-        for name, (shape, dtype) in files.items():
-            with (aside / f"{name}.npy").open("xb") as file:
-                write_header(file, shape, dtype)
-        (aside / _HEADER).write_text(json.dumps({**header, "key": uuid.uuid4().hex}))
-        try:
-            aside.rename(path)
-        except OSError:  # another process was faster; its store is checked like any other
-            if not path.exists():
-                raise
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
+        with outputs.new_folder(path) as new:
+            for name, (shape, dtype) in files.items():
+                with (new / f"{name}.npy").open("xb") as file:
+                    write_header(file, shape, dtype)
+            (new / _HEADER).write_text(json.dumps({**header, "key": uuid.uuid4().hex}))
+    except OSError:  # another process was faster; its store is checked like any other
+        if not path.exists():
+            raise
 
 
 def _check_store(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]) -> str:
     """Refuses a store of other inputs. Returns the key of the store."""
     try:
-        stored = _stored_header(path)
+        # Files are also written, so a link in a folder from a stranger could replace other files of the user.
+        for lock in path.glob(".lock.*"):
+            with contextlib.suppress(FileNotFoundError):  # released by another process
+                inputs.check(lock, "a lock of a store of arrays", links=False)
+        stored = inputs.store_header(path, _HEADER, "the header of a store of arrays")
     except Exception as error:
         raise ValueError(
             f"{path} exists but is not a readable store of arrays, or is damaged ({error}); name another path"
@@ -379,31 +371,11 @@ def _check_store(path: Path, header: Mapping[str, Any], near: Mapping[str, list[
     return key
 
 
-def _stored_header(path: Path) -> dict[str, Any]:
-    """The header of a store of the current version, or of a version up to 3, which zarr wrote."""
-    old = path / "zarr.json"
-    what = "the header of a store"
-    if old.exists() and not (path / _HEADER).exists():
-        return dict(inputs.json_object(old, what).get("attributes", {}))
-    _check_files(path, _HEADER)
-    return inputs.json_object(path / _HEADER, what)
-
-
-def _check_files(path: Path, name: str) -> None:
-    """Refuses links, which may lead out of the folder, and pipes, which would block."""
-    # Files are also written, so a link in a folder from a stranger could replace other files of the user.
-    what = "a part of a store of arrays"
-    inputs.check_unlinked(path / name, what)
-    for lock in path.glob(".lock.*"):
-        with contextlib.suppress(FileNotFoundError):  # released by another process
-            inputs.check_unlinked(lock, what)
-
-
 def _offset(path: Path, name: str, shape: tuple[int, ...], dtype: str) -> int:
     """Byte offset of the values of an array in its file."""
     file = path / f"{name}.npy"
     try:
-        _check_files(path, file.name)
+        inputs.check(file, "a part of a store of arrays", links=False)
         return read_header(file, shape, dtype)
     except FileNotFoundError:
         raise ValueError(f"{path} lacks the array {name}: it is damaged; delete it to start anew") from None

@@ -21,20 +21,21 @@ def shortened(text: object) -> str:
     return words if len(words) <= _SHOWN else f"{words[: _SHOWN // 2]}...{words[-_SHOWN // 4 :]}"
 
 
-def check(path: pathlib.Path, what: str) -> None:
+def check(path: pathlib.Path, what: str, *, links: bool = True) -> None:
     """Refuses what is not a regular file. A pipe in place of a file would block forever.
 
     Args:
         path: The file.
         what: Kind of the file for messages, such as "a mesh file".
+        links: Whether it may be a link. In a folder from a stranger a link may lead out of the folder.
 
     Raises:
         FileNotFoundError: Nothing has this name.
-        ValueError: It is a directory, a pipe, a device or a socket; or the name is too long, has a null character, or
-            is a link that leads to itself.
+        ValueError: It is a directory, a pipe, a device, a socket or a link that is not allowed; or the name is too
+            long, has a null character, or is a link that leads to itself.
     """
     try:
-        mode = path.stat().st_mode
+        mode = path.stat(follow_symlinks=links).st_mode
     except (FileNotFoundError, NotADirectoryError) as error:
         raise FileNotFoundError(f"{shortened(path)} must be {what}, and there is no such file") from error
     except ValueError as error:  # a null character
@@ -44,7 +45,8 @@ def check(path: pathlib.Path, what: str) -> None:
             raise
         raise ValueError(f"{str(path)[:200]!r} must be the path of {what}, got one with {error.strerror}") from error
     if not stat.S_ISREG(mode):
-        raise ValueError(f"{path} must be {what}, got a {'directory' if stat.S_ISDIR(mode) else 'special file'}")
+        came = {stat.S_IFDIR: "a directory", stat.S_IFLNK: "a link"}.get(stat.S_IFMT(mode), "a special file")
+        raise ValueError(f"{path} must be {what}, got {came}")
 
 
 def absence(path: pathlib.Path) -> str:
@@ -58,26 +60,9 @@ def absence(path: pathlib.Path) -> str:
     return ""
 
 
-def check_unlinked(path: pathlib.Path, what: str) -> None:
-    """Refuses, besides what `check` refuses, links, which may lead out of a folder from a stranger.
-
-    Args:
-        path: The file.
-        what: Kind of the file for messages, such as "an array of a saved object".
-    """
-    if path.is_symlink():
-        raise ValueError(f"{path.name} must be a file in the folder, got a link")
-    check(path, what)
-
-
-def content(path: pathlib.Path, what: str) -> bytes:
-    """The bytes of a regular file.
-
-    Args:
-        path: The file.
-        what: Kind of the file for messages, such as "a mesh file".
-    """
-    check(path, what)
+def content(path: pathlib.Path, what: str, *, links: bool = True) -> bytes:
+    """The bytes of a regular file, with the arguments of `check`."""
+    check(path, what, links=links)
     require.memory(f"the bytes of {path}", path.stat().st_size, "free some memory, or make the file smaller")
     return path.read_bytes()
 
@@ -112,14 +97,23 @@ def require_inside(path: pathlib.Path, folder: pathlib.Path, *, owner: str, outs
     return path
 
 
-def json_object(path: pathlib.Path, what: str) -> dict[str, Any]:
-    """The object that a JSON file holds.
+def store_header(folder: pathlib.Path, name: str, what: str) -> dict[str, Any]:
+    """The header of a folder that this package wrote, or that its first versions wrote by zarr.
 
     Args:
-        path: The file.
-        what: Kind of the file for messages, such as "a file of BRDFs".
+        folder: The folder.
+        name: Name of the header's file.
+        what: Kind of the file for messages.
     """
-    data = content(path, what)
+    zarr = folder / "zarr.json"
+    if zarr.exists() and not (folder / name).exists():
+        return dict(json_object(zarr, what, links=False).get("attributes", {}))
+    return json_object(folder / name, what, links=False)
+
+
+def json_object(path: pathlib.Path, what: str, *, links: bool = True) -> dict[str, Any]:
+    """The object that a JSON file holds, with the arguments of `check`."""
+    data = content(path, what, links=links)
     try:
         value = json.loads(data.decode("utf-8-sig"), object_pairs_hook=unique_names)
     except RecursionError:

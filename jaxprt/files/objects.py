@@ -17,7 +17,6 @@ import inspect
 import json
 import os
 import re
-import shutil
 import sys
 import types
 import typing
@@ -33,7 +32,7 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxprt import require
-from jaxprt.files import arrays, extensions, inputs
+from jaxprt.files import arrays, extensions, inputs, outputs
 
 _PLAIN: dict[Any, tuple[type, ...]] = {
     bool: (bool, np.bool_),
@@ -175,44 +174,6 @@ def _described(value: Any) -> str:
     return f"a {type(value).__name__}"
 
 
-def load_folder(path: Path) -> Any:
-    """The object in a folder; `jaxprt.files.objects.load` explains it."""
-    if not os.path.exists(path):  # unlike Path.exists, False for names that no file can have
-        raise FileNotFoundError(f"{path}: there is no such folder")
-    try:
-        header = _header(path)
-    except Exception as error:
-        raise ValueError(
-            f"{path} must be a folder that jaxprt.files.save wrote, got one that cannot be read: it is damaged, {error}"
-        ) from error
-    if header.get("format") != FORMAT:
-        came = str(header.get("format", "another kind of file or folder"))[:80]
-        raise ValueError(
-            f"{path} must be a folder that jaxprt.files.save wrote, got {came}, or it is damaged; a folder of "
-            "precomputed data is read by jaxprt.precompute(scene, path=)"
-        )
-    version, text = header.get("version"), header.get("content")
-    if version != VERSION or type(version) is not int:
-        newer = isinstance(version, int) and version > VERSION
-        earlier = "precompute and save it anew, or load it with the version of jaxprt that saved it"
-        cure = "update jaxprt" if newer else earlier
-        raise ValueError(
-            f"{path} must have format version {VERSION}, got {str(version)[:80]}: {cure}, or it is damaged"
-        )
-    if not isinstance(text, str) or zlib.crc32(text.encode("utf-8", "replace")) != header.get("checksum"):
-        raise ValueError(f"{path} is damaged: its description is not what was saved")
-    try:
-        return _Reader(path, json.loads(text)).value
-    except _KnownError as error:
-        raise ValueError(str(error)) from error
-    except MemoryError:
-        raise
-    except RecursionError:
-        raise ValueError(f"{path} is damaged: its description is nested too deeply") from None
-    except Exception as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-
-
 def construct(kind: type, field: dict[str, Any]) -> Any:
     """An object with these fields. Nothing is converted, checked or called, as when JAX unflattens a pytree."""
     if not dataclasses.is_dataclass(kind):
@@ -224,27 +185,27 @@ def construct(kind: type, field: dict[str, Any]) -> Any:
 
 
 class _KnownError(Exception):
-    """A folder that cannot be loaded for a reason other than damage."""
+    """What a folder holds that cannot be loaded for another reason than damage, and what to do."""
+
+    def __init__(self, what: str, cure: str = "load it with the version of jaxprt that saved it"):
+        super().__init__(f"{what}, or it is damaged: {cure}")
 
 
 class _Reader:
     """Makes `value`, the object that a description states. Refuses what does not have the form that `save` writes."""
 
     def __init__(self, path: Path, content: Any):
-        self._path = path
         tree, table, self._algorithm = _parts(content, {"tree": dict, "array": list, "algorithm": dict})
         for name, version in self._algorithm.items():
-            self._check_algorithm(name, version)
+            _check_module(name)
+            if algorithm_of(name) != version:
+                raise _KnownError(
+                    f"was made by version {str(version)[:80]} of the algorithm in {name}, this jaxprt has version "
+                    f"{algorithm_of(name)}, which gives other results",
+                    "compute it again",
+                )
         self._arrays: list[Any] = [_read(path, number, entry) for number, entry in enumerate(table)]
         self.value = self._make(tree, False)
-
-    def _check_algorithm(self, name: str, version: Any) -> None:
-        _check_module(self._path, name)
-        if algorithm_of(name) != version:
-            raise _KnownError(
-                f"{self._path} was made by version {str(version)[:80]} of the algorithm in {name}, this jaxprt has "
-                f"version {algorithm_of(name)}, which gives other results, or it is damaged: compute it again"
-            )
 
     def _make(self, node: Any, batched: bool) -> Any:
         """The value that a node of the description represents."""
@@ -268,21 +229,16 @@ class _Reader:
         if kind == "function":
             (name,) = _parts(node, {"function": str})
             if name not in _FUNCTIONS:
-                raise _KnownError(
-                    f"{self._path} names the function {name!r}, which this version of jaxprt does not save: it is "
-                    "damaged, or was saved by another version"
-                )
+                raise _KnownError(f"names the function {name!r}, which this jaxprt does not have")
             return function(name)
         name, field = _parts(node, {"class": str, "field": dict})
         return self._object(name, field, batched)
 
     def _object(self, name: str, field: dict[str, Any], batched: bool) -> Any:
-        kind = _class(self._path, name)
+        kind = _class(name)
         if list(field) != names(kind):
-            raise _KnownError(
-                f"{self._path} holds a {name} with the fields {', '.join(field)}, this jaxprt's has "
-                f"{', '.join(names(kind))}: load it with the version of jaxprt that saved it, or it is damaged"
-            )
+            came, wanted = ", ".join(field), ", ".join(names(kind))
+            raise _KnownError(f"holds a {name} with the fields {came}, this jaxprt's has {wanted}")
         if kind.__module__ not in self._algorithm:
             raise ValueError(f"its description must state the algorithm of {kind.__module__}, got none")
         result = construct(
@@ -304,10 +260,8 @@ class _Reader:
             self._arrays[number] = value = np.array(value)
         if kind == "jax" and isinstance(value, np.ndarray):
             if jax.dtypes.canonicalize_dtype(value.dtype) != value.dtype:
-                raise _KnownError(
-                    f"{self._path} holds arrays of {value.dtype}, which JAX has only with jax_enable_x64: enable it to "
-                    "load them, or it is damaged"
-                )
+                what = f"holds arrays of {value.dtype}, which JAX has only with jax_enable_x64"
+                raise _KnownError(what, "enable it to load them")
             self._arrays[number] = value = jax.device_put(value)
         return value
 
@@ -336,7 +290,7 @@ def _read(path: Path, number: int, entry: Any) -> np.ndarray:
             raise ValueError("it is not of numbers")
         kind = storable(np.empty(0, dtype)).dtype.str
         file = path / f"{number}.npy"
-        inputs.check_unlinked(file, "an array of a saved object")
+        inputs.check(file, "an array of a saved object", links=False)
         value = arrays.open_array(file, arrays.read_header(file, tuple(shape), kind), tuple(shape), kind).view(dtype)
         right = checksum(value) == expected
     except Exception as error:
@@ -346,34 +300,27 @@ def _read(path: Path, number: int, entry: Any) -> np.ndarray:
     return value
 
 
-def _class(path: Path, name: str) -> type:
+def _class(name: str) -> type:
     """A data class of this package, or one that another package has registered, by name."""
     module, _, kind = name.partition(":")
-    _check_module(path, module)
+    _check_module(module)
     result = extensions.CLASSES.get(name) or getattr(sys.modules.get(module), kind, None)
     if not isinstance(result, type) or result.__module__ != module or not _is_known(result):
-        raise _KnownError(
-            f"{path} names the class {name[:80]!r}, which this jaxprt does not have: it is damaged, or was saved by "
-            "another version"
-        )
+        raise _KnownError(f"names the class {name[:80]!r}, which this jaxprt does not have")
     return result
 
 
-def _check_module(path: Path, name: str) -> None:
+def _check_module(name: str) -> None:
     """Imports a module of this package. Modules of other packages are never imported because a file names them."""
     if re.fullmatch(r"jaxprt(\.[a-z][a-z_]*)+", name):
         try:
             importlib.import_module(name)
         except ImportError:
-            raise _KnownError(
-                f"{path} names the module {name[:80]!r}, which this jaxprt does not have: it is damaged, or was saved "
-                "by another version"
-            ) from None
-        return
-    if name not in extensions.modules():
+            raise _KnownError(f"names the module {name[:80]!r}, which this jaxprt does not have") from None
+    elif name not in extensions.modules():
         raise _KnownError(
-            f"{path} names the module {name[:80]!r}, of which no class is registered: import the package that calls "
-            "jaxprt.register for its classes, or it is damaged"
+            f"names the module {name[:80]!r}, of which no class is registered",
+            "import the package that calls jaxprt.register for its classes",
         )
 
 
@@ -415,17 +362,6 @@ def checksum(value: np.ndarray) -> int:
     return zlib.crc32(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data)
 
 
-def _header(path: Path) -> dict[str, Any]:
-    """The header of a saved object, of the current version or of version 1, which zarr wrote."""
-    if (path / HEADER).exists():
-        inputs.check_unlinked(path / HEADER, "an object that jaxprt.files.save wrote")
-        return inputs.json_object(path / HEADER, "the description of a saved object")
-    if (path / "zarr.json").exists():
-        inputs.check_unlinked(path / "zarr.json", "an object that jaxprt.files.save wrote")
-        return dict(inputs.json_object(path / "zarr.json", "the description of a saved object").get("attributes", {}))
-    return {}
-
-
 @require.arguments(path=partial(require.path, "path"))
 def save(path: str | os.PathLike, object: Any) -> None:
     """Saves an object of this package, or tuples, lists and dictionaries of such objects, without loss.
@@ -457,21 +393,13 @@ def save(path: str | os.PathLike, object: Any) -> None:
     content = json.dumps({"tree": tree, "array": table, "algorithm": algorithm})
     header = {"format": FORMAT, "version": VERSION}
     header |= {"content": content, "checksum": zlib.crc32(content.encode())}
-    aside = path.with_name(f"{path.name}.{os.getpid()}.new")
-    shutil.rmtree(aside, ignore_errors=True)
-    try:
-        aside.mkdir(parents=True)
+    with outputs.new_folder(path) as new:
         for number, (_, array) in enumerate(leaves):
             stored = storable(array)
-            with (aside / f"{number}.npy").open("xb") as file:
+            with (new / f"{number}.npy").open("xb") as file:
                 arrays.write_header(file, stored.shape, stored.dtype.str)
                 file.write(stored.reshape(-1).view(np.uint8).data)
-        (aside / HEADER).write_text(json.dumps(header))
-        if path.exists():
-            raise FileExistsError(f"{path} exists; remove it or name another path")
-        aside.rename(path)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
+        (new / HEADER).write_text(json.dumps(header))
 
 
 @require.arguments(path=partial(require.path, "path"))
@@ -492,7 +420,43 @@ def load(path: str | os.PathLike) -> Any:
         ValueError: The folder was not written by `save`, is damaged, was saved by a newer version of this package or by
             a version whose algorithms give other results, or holds 64-bit numbers while JAX is set to 32 bits.
     """
-    return load_folder(Path(path))
+    path = Path(path)
+    if not os.path.exists(path):  # unlike Path.exists, False for names that no file can have
+        raise FileNotFoundError(f"{path}: there is no such folder")
+    try:
+        header = inputs.store_header(path, HEADER, "the description of a saved object")
+    except FileNotFoundError:
+        header = {}
+    except Exception as error:
+        raise ValueError(
+            f"{path} must be a folder that jaxprt.files.save wrote, got one that cannot be read: it is damaged, {error}"
+        ) from error
+    if header.get("format") != FORMAT:
+        came = str(header.get("format", "another kind of file or folder"))[:80]
+        raise ValueError(
+            f"{path} must be a folder that jaxprt.files.save wrote, got {came}, or it is damaged; a folder of "
+            "precomputed data is read by jaxprt.precompute(scene, path=)"
+        )
+    version, text = header.get("version"), header.get("content")
+    if version != VERSION or type(version) is not int:
+        newer = isinstance(version, int) and version > VERSION
+        earlier = "precompute and save it anew, or load it with the version of jaxprt that saved it"
+        cure = "update jaxprt" if newer else earlier
+        raise ValueError(
+            f"{path} must have format version {VERSION}, got {str(version)[:80]}: {cure}, or it is damaged"
+        )
+    if not isinstance(text, str) or zlib.crc32(text.encode("utf-8", "replace")) != header.get("checksum"):
+        raise ValueError(f"{path} is damaged: its description is not what was saved")
+    try:
+        return _Reader(path, json.loads(text)).value
+    except _KnownError as error:
+        raise ValueError(f"{path} {error}") from error
+    except MemoryError:
+        raise
+    except RecursionError:
+        raise ValueError(f"{path} is damaged: its description is nested too deeply") from None
+    except Exception as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
 
 
 def reduced(object: Any) -> tuple:

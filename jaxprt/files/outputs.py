@@ -1,16 +1,17 @@
 """Output files: written beside the old file, checked, and renamed, so that a failure leaves the old file as it was."""
 
 import contextlib
+import errno
 import os
 import pathlib
 import re
 import secrets
+import shutil
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import OpenEXR
 import OpenImageIO
 from jaxtyping import Array, Float
 
@@ -18,8 +19,8 @@ from jaxprt import require
 from jaxprt.files import pixels
 
 _PNG_END = b"\0\0\0\0IEND\xae\x42\x60\x82"  # the last chunk, with its checksum
+_NAMES = {1: "Y", 3: "RGB", 4: "RGBA"}  # channels of an image, by their number
 _INCOMPLETE = "the file is incomplete; the disk may be full"
-_BLOCK = 2**21  # values that are compared per step
 # Channels of the layers of pictures. Blender and Nuke read R, G, B and A as the picture and Z as its depth.
 LAYERS = {
     "color": ("R", "G", "B"),
@@ -80,6 +81,29 @@ def replacing(path: str | os.PathLike) -> Iterator[pathlib.Path]:
         raise _name_error(path, error) from error
     finally:
         new.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def new_folder(path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """A new folder beside `path`, which gets this name when the block ends: no process sees an incomplete one.
+
+    Args:
+        path: The folder, which must not exist yet. Missing parents are created.
+
+    Yields:
+        Path of the new folder. It is removed after an error.
+    """
+    new = path.with_name(f".{secrets.token_hex(8)}.new")
+    try:
+        new.mkdir(parents=True)
+        yield new
+        if path.exists():  # An empty folder would be replaced.
+            raise FileExistsError(errno.EEXIST, "it exists; remove it or name another path")
+        new.rename(path)
+    except OSError as error:
+        raise _name_error(path, error) from error
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
 
 
 def write(path: str | os.PathLike, content: bytes | str) -> None:
@@ -144,19 +168,11 @@ def write_exr(
     if isinstance(image, Mapping):
         channels = _layer_channels(image)
     else:
-        names = _channel_names(image, {1: "Y", 3: "RGB", 4: "RGBA"})
+        names = _channel_names(image)
         channels = {name: np.asarray(image, np.float32)[..., i] for i, name in enumerate(names)}
-    target(path, ".exr")
-    # OpenEXR silently writes wrong values for arrays that are not contiguous.
-    channels = {name: np.ascontiguousarray(values) for name, values in channels.items()}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with replacing(path) as new:
-        try:
-            with OpenEXR.File(header, dict(channels)) as file:  # which replaces the values of the dictionary
-                file.write(str(new))
-        except RuntimeError as error:  # also for a full disk
-            raise OSError(str(error).replace(str(new), os.fspath(path))) from error
-        _compare(new, np.stack(list(channels.values()), -1), "float", names=list(channels))
+    path = target(path, ".exr")
+    # An empty date makes equal pictures equal files.
+    _write(path, np.stack(list(channels.values()), -1), list(channels), {"compression": "zip", "DateTime": ""})
 
 
 def is_layer_name(name: str) -> bool:
@@ -199,63 +215,57 @@ def write_png(path: str | pathlib.Path, image: Float[np.ndarray | Array, "h w c"
             the name does not end in .png.
         OSError: The file cannot be written. An old file is unchanged.
     """
-    _channel_names(image, {1: "Y", 3: "RGB", 4: "RGBA"})
-    target(path, ".png")
+    names = _channel_names(image)
+    path = target(path, ".png")
     values = np.asarray(image, np.float64)
     wrong = np.argwhere(np.isnan(values).any(axis=-1))
     if len(wrong):
         raise ValueError(f"image must not hold NaN, got {len(wrong)} such pixels, first at {tuple(map(int, wrong[0]))}")
-    values = np.ascontiguousarray(np.round(np.clip(values, 0, 1) * 255).astype(np.uint8))
+    values = np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
+    _write(path, values, names, {"oiio:ColorSpace": "sRGB", "oiio:UnassociatedAlpha": 1})
+
+
+def _write(path: pathlib.Path, values: np.ndarray, names: Sequence[str], attributes: Mapping[str, Any]) -> None:
+    """Writes pixels [h, w, c], and checks that they are in the file bit by bit."""
     height, width, count = values.shape
-    spec = OpenImageIO.ImageSpec(width, height, count, "uint8")
-    spec.attribute("oiio:ColorSpace", "sRGB")
-    spec.attribute("oiio:UnassociatedAlpha", 1)
-    output = OpenImageIO.ImageOutput.create("png")
-    assert output is not None  # OpenImageIO's wheels include PNG.
+    spec = OpenImageIO.ImageSpec(width, height, count, {np.float32: "float", np.uint8: "uint8"}[values.dtype.type])
+    spec.channelnames = tuple(names)
+    for name, value in attributes.items():
+        spec.attribute(name, value)
     with replacing(path) as new:
-        # The encoder does not report a full disk, so its word alone does not count.
-        if not (output.open(str(new), spec) and output.write_image(values) and output.close()):
+        output = OpenImageIO.ImageOutput.create(str(new))
+        if output is None:
+            raise OSError(OpenImageIO.geterror())
+        # Encoders do not report every full disk, so their word alone does not count.
+        if not (output.open(str(new), spec) and output.write_image(np.ascontiguousarray(values)) and output.close()):
             raise OSError(output.geterror().replace(str(new), os.fspath(path)) or "the encoder failed")
-        _compare(new, values, "uint8")
-        with new.open("rb") as file:
-            file.seek(-len(_PNG_END), os.SEEK_END)
-            if file.read() != _PNG_END:  # The pixels can be read without it, but not by every program.
-                raise OSError(_INCOMPLETE)
+        _compare(new, values, names)
 
 
-def _channel_names(image: Float[np.ndarray | Array, "h w c"], names: dict[int, str]) -> str:
+def _compare(path: pathlib.Path, values: np.ndarray, names: Sequence[str]) -> None:
+    """Raises an OSError if a file does not hold the values of channels of some names, bit by bit."""
+    try:
+        with pixels.opened(path) as reader:
+            spec = reader.spec()
+            whole = (spec.height, spec.width, spec.nchannels) == values.shape
+            order = [spec.channelnames.index(name) for name in names]
+            form = "uint8" if values.dtype == np.uint8 else "float"
+            for rows, block in pixels.blocks(reader, channels=order, form=form) if whole else ():
+                whole &= block.tobytes() == values[rows.start : rows.stop].tobytes()
+    except (pixels.DamageError, ValueError):  # ValueError: a channel of another name
+        whole = False
+    with path.open("rb") as file:  # The pixels of PNG files can be read without their end, but not by every program.
+        whole = whole and (path.suffix.lower() != ".png" or file.read().endswith(_PNG_END))
+    if not whole:
+        raise OSError(_INCOMPLETE)
+
+
+def _channel_names(image: Float[np.ndarray | Array, "h w c"]) -> str:
+    """Names of the channels of an image, which must be of floating point."""
     require.real("image", image)
     require.array("image", image, "h w c")
     if image.dtype.kind != "f":
         raise ValueError(f"image must be of floating point, with 1 for white in pictures, got {image.dtype}")
-    if image.ndim != 3 or 0 in image.shape or image.shape[-1] not in names:
-        raise ValueError(f"image must be [h, w, c] with c one of {list(names)} and no empty axis, got {image.shape}")
-    return names[image.shape[-1]]
-
-
-def _compare(path: pathlib.Path, values: np.ndarray, form: str, *, names: Sequence[str] | None = None) -> None:
-    """Raises an OSError if a file does not hold the values, bit by bit; `names` are those of channels in any order."""
-    config = OpenImageIO.ImageSpec()
-    config.attribute("oiio:UnassociatedAlpha", 1)
-    reader = OpenImageIO.ImageInput.open(str(path), config)
-    if reader is None:
-        OpenImageIO.geterror()  # Otherwise it is printed at the end of the program.
-        raise OSError(_INCOMPLETE)
-    try:
-        spec = reader.spec()
-        if (spec.height, spec.width, spec.nchannels) != values.shape:
-            raise OSError(_INCOMPLETE)
-        order = list(range(spec.nchannels)) if names is None else [names.index(name) for name in spec.channelnames]
-        step = max(16, _BLOCK // (spec.width * spec.nchannels) // 16 * 16)  # EXR has blocks of 16 rows.
-        for first in range(0, spec.height, step):
-            rows = range(first, min(first + step, spec.height))
-            block = pixels.read_block(reader, rows, channels=range(spec.nchannels), form=form)
-            same = block.view(np.uint8) == np.ascontiguousarray(values[rows.start : rows.stop][..., order]).view(
-                np.uint8
-            )
-            if not same.all():
-                raise OSError(_INCOMPLETE)
-    except ValueError as error:
-        raise OSError(_INCOMPLETE) from error
-    finally:
-        reader.close()
+    if 0 in image.shape or image.shape[-1] not in _NAMES:
+        raise ValueError(f"image must be [h, w, c] with c one of {list(_NAMES)} and no empty axis, got {image.shape}")
+    return _NAMES[image.shape[-1]]

@@ -1,5 +1,6 @@
-"""Pixels of image files: how many there may be, how they are read in blocks of rows, and how they are turned."""
+"""Pixels of image files: how many there may be, how they are read in blocks of rows, turned, and their colors."""
 
+import contextlib
 import pathlib
 import struct
 import zlib
@@ -7,7 +8,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+import OpenImageIO
+from jaxtyping import Float32, Float64, Num
 
 from jaxprt import require
 
@@ -19,6 +21,13 @@ _BLOCKS = 16 * _VALUES  # bytes of the temporary arrays of a block, several of f
 # Chromaticities x, y of red, green, blue and white.
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 ACES_AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.0770, 0.32168, 0.33767)
+PRIMARIES = {  # by the color interop IDs of the ASWF's Color Interop Forum that stand for linear values
+    "lin_ap0_scene": ACES_AP0,
+    "lin_ap1_scene": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767),
+    "lin_p3d65_scene": (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290),
+    "lin_rec2020_scene": (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290),
+    "lin_adobergb_scene": (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290),
+}
 # Chromaticities are written with three to five digits.
 _SAME = 1e-3
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
@@ -34,13 +43,7 @@ _SRGB_HALF = ((0.5 + 0.055) / 1.055) ** 2.4
 
 
 def check_size(name: str | pathlib.Path, height: int, width: int) -> None:
-    """Refuses images without pixels, and with too many.
-
-    Args:
-        name: The image, for the message.
-        height: Rows that the header states.
-        width: Columns that the header states.
-    """
+    """Refuses images that have no pixels, or too many by their header."""
     if height < 1 or width < 1 or height * width > MAX_PIXELS:
         raise ValueError(
             f"{name} must have 1 to {MAX_PIXELS} pixels, got {width} x {height} (width x height): reduce its size in "
@@ -49,15 +52,7 @@ def check_size(name: str | pathlib.Path, height: int, width: int) -> None:
 
 
 def check_memory(name: str | pathlib.Path, height: int, width: int, channels: int, *, decoder: int) -> None:
-    """Refuses images that do not fit into memory, before any pixel is read.
-
-    Args:
-        name: The image, for the message.
-        height: Rows.
-        width: Columns.
-        channels: Channels that are read, as float32.
-        decoder: Bytes that the decoder allocates besides.
-    """
+    """Refuses images that do not fit into memory as float32, beside the bytes that their decoder allocates."""
     require.memory(
         f"{name}: {width} x {height} pixels (width x height) of {channels} channels",
         4 * height * width * channels + decoder + _BLOCKS,
@@ -66,82 +61,113 @@ def check_memory(name: str | pathlib.Path, height: int, width: int, channels: in
 
 
 def row_blocks(image: np.ndarray) -> Iterator[np.ndarray]:
-    """Blocks of rows of an image, which are views of it. Between two blocks Ctrl-C takes effect.
-
-    Args:
-        image: Pixels [h, w, c].
-
-    Yields:
-        Consecutive rows.
-    """
+    """Blocks of rows of an image, which are views of it. Between two blocks Ctrl-C takes effect."""
     step = max(1, _VALUES // (image.shape[1] * image.shape[2]))
     for first in range(0, len(image), step):
         yield image[first : first + step]
 
 
-def read_block(reader: Any, rows: range, *, part: int = 0, channels: range, form: str = "float") -> np.ndarray:
-    """Some rows of an image file that OpenImageIO reads, of scan lines or of tiles, at the finest level.
+class DamageError(Exception):
+    """What a decoder says of a file that it cannot read."""
+
+
+@contextlib.contextmanager
+def opened(path: pathlib.Path) -> Iterator[Any]:
+    """OpenImageIO's reader of a file, an `OpenImageIO.ImageInput`; DamageError if there is none."""
+    config = OpenImageIO.ImageSpec()
+    config.attribute("oiio:UnassociatedAlpha", 1)  # Otherwise colors come premultiplied by alpha.
+    reader = OpenImageIO.ImageInput.open(str(path), config)
+    if reader is None:
+        raise DamageError(OpenImageIO.geterror())  # which is printed at the end of the program unless it is asked for
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+def read(
+    reader: Any,
+    name: str,
+    *,
+    part: int = 0,
+    channels: Sequence[str] | None = None,
+    window: Any = None,
+    decoder: int = 0,
+) -> Float32[np.ndarray, "h w c"]:
+    """Reads an image, if it has the right size and fits into memory, at the finest level.
 
     Args:
-        reader: The opened file, an `OpenImageIO.ImageInput`.
-        rows: Rows in the coordinates of the file. The first must be the first of a row of tiles.
-        part: Number of the image in the file.
-        channels: Channels.
-        form: Type of the result: "float", or "uint32" for channels of whole numbers in EXR files.
-
-    Returns:
-        The pixels, [rows, w, channels].
+        reader: The opened file.
+        name: The image, for messages.
+        part: Index of the image in the file.
+        channels: Names of the channels that are read; None reads all.
+        window: What is returned, an `OpenImageIO.ROI`, with zeros where the file has no pixels; None is that of the
+            pixels.
+        decoder: Bytes that the decoder allocates besides blocks of rows.
     """
+    reader.seek_subimage(part, 0)
     spec = reader.spec()
-    span = channels.start, channels.stop, form
-    if spec.tile_width:
-        columns = spec.x, spec.x + spec.width
-        block = reader.read_tiles(part, 0, *columns, rows.start, rows.stop, 0, 1, *span)
-    else:
-        block = reader.read_scanlines(part, 0, rows.start, rows.stop, 0, *span)
-    # Some readers return incomplete data and only report an error.
-    error = reader.geterror()
-    if block is None or error:
-        raise ValueError(error or "no pixels")
-    return np.asarray(block).reshape(len(rows), spec.width, len(channels))
+    data, tile = spec.roi, _chunk_size(spec)
+    window = window or data
+    for height, width in ((window.height, window.width), (data.height, data.width), tile):
+        check_size(name, height, width)
+    top, left = data.ybegin - window.ybegin, data.xbegin - window.xbegin
+    if top >= window.height or left >= window.width or top + data.height <= 0 or left + data.width <= 0:
+        raise ValueError(
+            f"{name} must have a data window that overlaps its display window, got columns {data.xbegin}.."
+            f"{data.xend - 1} and rows {data.ybegin}..{data.yend - 1} outside of it"
+        )
+    indices = [spec.channelnames.index(channel) for channel in channels or spec.channelnames]
+    kinds = {str(spec.channelformats[index]) for index in indices} if spec.channelformats else {str(spec.format)}
+    # OpenImageIO would divide the whole numbers of EXR files by the largest one.
+    form = "uint32" if kinds == {"uint"} and reader.format_name() == "openexr" else "float"
+    # The decoder unpacks all channels of whole tiles, with a copy, and converts them to float32.
+    block = 4 * min(_block_rows(spec), data.height) * data.width
+    decoder += spec.nchannels * (block + (2 * spec.format.size() + 4) * tile[0] * tile[1])
+    check_memory(name, window.height, window.width, len(indices), decoder=decoder)
+
+    image = np.zeros((window.height, window.width, len(indices)), np.float32)
+    for rows, values in blocks(reader, part=part, channels=indices, form=form):
+        first = top + rows.start
+        inside = image[max(first, 0) : max(first + len(rows), 0), max(left, 0) : left + data.width]
+        above, before = max(-first, 0), max(-left, 0)
+        inside[...] = values[above : above + inside.shape[0], before : before + inside.shape[1]]
+    return image
 
 
-def tile_size(spec: Any) -> tuple[int, int]:
-    """Height and width of the tiles of a file that OpenImageIO reads; 1 x 1 for scan lines."""
-    return (spec.tile_height, spec.tile_width) if spec.tile_width else (1, 1)
-
-
-def block_rows(spec: Any) -> int:
-    """Rows that `read_rows` reads at once: whole rows of tiles."""
-    height, _ = tile_size(spec)
-    step = max(1, _VALUES // (spec.width * spec.nchannels))
-    return -(-step // height) * height
-
-
-def block_bytes(spec: Any) -> int:
-    """Most bytes that `read_rows` needs besides the image: a block of rows in float32, and a tile.
-
-    Tiles may be larger than the image. The decoder unpacks whole ones, with a copy, and converts them to float32.
-    """
-    height, width = tile_size(spec)
-    block = min(block_rows(spec), spec.height) * spec.width
-    return spec.nchannels * (4 * block + (2 * spec.format.size() + 4) * height * width)
-
-
-def read_rows(reader: Any, image: np.ndarray) -> None:
-    """Reads all rows of the first image of a file, block by block, into an array.
-
-    Args:
-        reader: The opened file, an `OpenImageIO.ImageInput`.
-        image: The array [h, w, c] to fill, of all channels of the file.
-    """
+def blocks(
+    reader: Any, *, part: int = 0, channels: Sequence[int], form: str
+) -> Iterator[tuple[range, Num[np.ndarray, "h w c"]]]:
+    """Blocks of rows of an image, counted from 0, with the channels of some indices in a type of OpenImageIO's name."""
     spec = reader.spec()
-    step = block_rows(spec)
+    step = _block_rows(spec)
+    span = min(channels), max(channels) + 1
     for first in range(0, spec.height, step):
         rows = range(first, min(first + step, spec.height))
-        image[rows.start : rows.stop] = read_block(
-            reader, range(spec.y + rows.start, spec.y + rows.stop), channels=range(spec.nchannels)
-        )
+        lines = spec.y + rows.start, spec.y + rows.stop
+        if spec.tile_width:
+            block = reader.read_tiles(part, 0, spec.x, spec.x + spec.width, *lines, 0, 1, *span, form)
+        else:
+            block = reader.read_scanlines(part, 0, *lines, 0, *span, form)
+        # Some readers return incomplete data and only report an error.
+        error = reader.geterror()
+        if block is None or error:
+            raise DamageError(error or "no pixels")
+        values = np.asarray(block).reshape(len(rows), spec.width, span[1] - span[0])
+        yield rows, values[..., [index - span[0] for index in channels]]
+
+
+def _block_rows(spec: Any) -> int:
+    """Rows that are read at once: whole rows of tiles, which may be larger than the image."""
+    height, _ = _chunk_size(spec)
+    return -(-max(1, _VALUES // (spec.width * spec.nchannels)) // height) * height
+
+
+def _chunk_size(spec: Any) -> tuple[int, int]:
+    """Height and width of what a decoder unpacks at once: tiles, or scan lines that are compressed together."""
+    if spec.tile_width:
+        return spec.tile_height, spec.tile_width
+    return max(1, spec.get_int_attribute("oiio:RowsPerChunk", 1)), spec.width
 
 
 def upright(image: np.ndarray, orientation: int) -> np.ndarray:
@@ -164,11 +190,7 @@ def upright(image: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def decode_srgb(image: np.ndarray) -> None:
-    """Decodes sRGB values to linear ones in place (IEC 61966-2-1).
-
-    Args:
-        image: Encoded values [h, w, c] of 0 to 1.
-    """
+    """Decodes sRGB values [h, w, c] of 0 to 1 to linear ones in place (IEC 61966-2-1)."""
     for rows in row_blocks(image):
         rows[...] = srgb_to_linear(rows)
 
@@ -205,12 +227,7 @@ def to_rec709(chromaticities: Sequence[float], name: str) -> Float64[np.ndarray,
 
 
 def convert(image: np.ndarray, matrix: np.ndarray) -> None:
-    """Multiplies the first three channels by a matrix, in place.
-
-    Args:
-        image: Pixels [h, w, c] with at least three channels.
-        matrix: The matrix, for colors in columns.
-    """
+    """Multiplies the first three channels of pixels [h, w, c] by a matrix, for colors in columns, in place."""
     with np.errstate(invalid="ignore", over="ignore"):  # An infinite channel may become NaN; neither is hidden.
         for rows in row_blocks(image):
             rows[..., :3] = rows[..., :3] @ matrix.T.astype(np.float32)
@@ -238,18 +255,17 @@ def icc_difference(profile: bytes, *, curves: bool) -> str:
     return ""
 
 
-def png_color(start: bytes) -> tuple[float | None, str]:
+def png_color(chunk: dict[bytes, bytes]) -> tuple[float | None, str]:
     """The gamma that a PNG file states, and how its colors differ from sRGB otherwise, apart from ICC profiles.
 
     Args:
-        start: The file, at least up to its pixels.
+        chunk: The chunks before the pixels, by `png_chunks`.
 
     Returns:
         Exponent that decodes the values; None for sRGB. Description for a warning, empty if there is nothing to say.
 
     Reference: PNG specification, third edition, section 11.3.2 and 12.
     """
-    chunk = _png_chunks(start)
     if b"cICP" in chunk:  # It overrides all others. 1 and 13 are the primaries and the curve of sRGB.
         code = tuple(chunk[b"cICP"][:2])
         return None, "" if code == (1, 13) else f"a cICP chunk with the code points {code}, where sRGB has (1, 13)"
@@ -307,91 +323,80 @@ def _icc_half(curve: bytes) -> float | None:
         return float(np.power(np.float64(max(scale * 0.5 + shift, 0.0)), gamma))
 
 
-def _png_chunks(start: bytes) -> dict[bytes, bytes]:
-    """Chunks before the pixels."""
-    chunk, place = {}, 8
-    while place + 8 <= len(start):
-        size, name = struct.unpack(">I4s", start[place : place + 8])
-        if name == b"IDAT":
-            break
-        chunk[name] = start[place + 8 : place + 8 + size]
-        place += 12 + size
-    return chunk
+def png_chunks(content: bytes, name: str) -> dict[bytes, bytes]:
+    """The chunks of a PNG file up to the end of its pixels, which libpng can read.
 
-
-def png_damage(content: bytes, name: str) -> str:
-    """Why libpng cannot read a PNG file; empty if it can. libpng itself prints the reason on the standard error.
+    libpng itself prints a line on the standard error for a file that it cannot read.
 
     Args:
         content: The file.
         name: Name of the file in messages.
+
+    Raises:
+        DamageError: libpng cannot read the file.
+
     Reference: PNG specification, third edition, sections 5, 7, 9 and 11.2.
     """
-    chunk, damage = _needed_chunks(content)
-    if damage:
-        return damage
-    header, data = chunk[b"IHDR"], chunk[b"IDAT"]
+    chunk: dict[bytes, bytes] = {}
+    start, data = 8, []
+    # libpng reads on to the end of the file after the pixels only where they are interlaced.
+    while not data or content[start + 4 : start + 8] == b"IDAT" or chunk[b"IHDR"][12:] == b"\1":
+        size, kind = int.from_bytes(content[start : start + 4], "big"), content[start + 4 : start + 8]
+        body, end = content[start + 8 : start + 8 + size], start + 12 + size
+        if len(content) < end or not kind.isalpha() or kind[2] & 32:  # the third letter is a capital
+            raise DamageError(f"a file that is cut off or damaged at byte {start}")
+        needed = not kind[0] & 32  # a capital
+        known = kind in (b"IHDR", b"PLTE", b"IDAT", b"IEND") and kind not in chunk
+        if (kind == b"IHDR") != (start == 8) or (needed and not known):
+            raise DamageError(f"a chunk {kind.decode()} at byte {start}, which no PNG file has there")
+        if kind == b"IEND":
+            break
+        if needed and zlib.crc32(kind + body) != int.from_bytes(content[end - 4 : end], "big"):
+            raise DamageError(f"a chunk {kind.decode()} at byte {start} with a wrong checksum")
+        if kind == b"IDAT":
+            data.append(body)
+        elif needed or not data:
+            chunk[kind] = body
+        start = end
+    header = chunk[b"IHDR"]
     if len(header) != 13:
-        return f"a header of {len(header)} bytes, which must have 13"
+        raise DamageError(f"a header of {len(header)} bytes, which must have 13")
     width, height, depth, color, *methods, interlaced = struct.unpack(">2I5B", header)
     if depth not in _PNG_DEPTHS.get(color, ()) or any(methods) or interlaced > 1:
-        return f"depth {depth}, color type {color} and methods {[*methods, interlaced]}, which no PNG file has"
+        words = f"depth {depth}, color type {color} and methods {[*methods, interlaced]}"
+        raise DamageError(f"{words}, which no PNG file has")
     palette = len(chunk.get(b"PLTE", b""))
     if color == 3 and (not 0 < palette <= 768 or palette % 3):
-        return f"a palette of {palette} bytes, which must have 3 for each of 1 to 256 colors"
+        raise DamageError(f"a palette of {palette} bytes, which must have 3 for each of 1 to 256 colors")
     check_size(name, height, width)
     if max(width, height) > _PNG_LONGEST:
-        return f"{width} x {height} pixels (width x height), which must have edges of at most {_PNG_LONGEST}"
+        raise DamageError(
+            f"{width} x {height} pixels (width x height), which must have edges of at most {_PNG_LONGEST}"
+        )
     channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}[color]
+    packed = b"".join(data)
     # The compressed bytes, and the scan lines with the filter of each.
-    check_memory(name, height, width, channels, decoder=len(data) + height * (width * depth * channels // 8 + 2))
-    return _scanline_damage(data, width, height, depth * channels, interlaced=bool(interlaced))
+    check_memory(name, height, width, channels, decoder=len(packed) + height * (width * depth * channels // 8 + 2))
+    _check_scanlines(packed, width, height, depth * channels, interlaced=bool(interlaced))
+    return chunk
 
 
-def _needed_chunks(content: bytes) -> tuple[dict[bytes, bytes], str]:
-    """The chunks without which a PNG file cannot be read, those of one kind joined; and what is wrong with them."""
-    chunk: dict[bytes, bytes] = {}
-    place, pixels = 8, []
-    # libpng reads on to the end of the file after the pixels only where they are interlaced.
-    while not pixels or content[place + 4 : place + 8] == b"IDAT" or chunk[b"IHDR"][12:] == b"\1":
-        size, kind = int.from_bytes(content[place : place + 4], "big"), content[place + 4 : place + 8]
-        body, end = content[place + 8 : place + 8 + size], place + 12 + size
-        if len(content) < end or not kind.isalpha() or kind[2] & 32:  # the third letter is a capital
-            return chunk, f"a file that is cut off or damaged at byte {place}"
-        if not kind[0] & 32:  # a capital: the chunk is needed
-            if (kind == b"IHDR") != (place == 8) or kind not in (b"IHDR", b"PLTE", b"IDAT", b"IEND") or kind in chunk:
-                return chunk, f"a chunk {kind.decode()} at byte {place}, which no PNG file has there"
-            if kind != b"IEND" and zlib.crc32(kind + body) != int.from_bytes(content[end - 4 : end], "big"):
-                return chunk, f"a chunk {kind.decode()} at byte {place} with a wrong checksum"
-            if kind == b"IEND":
-                break
-            if kind == b"IDAT":
-                pixels.append(body)
-            else:
-                chunk[kind] = body
-        elif place == 8:
-            return chunk, "a file that does not start with IHDR"
-        place = end
-    return chunk | {b"IDAT": b"".join(pixels)}, ""
-
-
-def _scanline_damage(data: bytes, width: int, height: int, bits: int, *, interlaced: bool) -> str:
-    """Why the scan lines of a PNG file, with so many bits for each pixel, cannot be read; empty if they can."""
+def _check_scanlines(packed: bytes, width: int, height: int, bits: int, *, interlaced: bool) -> None:
+    """Raises DamageError for scan lines of a PNG file, with so many bits for each pixel, that cannot be read."""
     passes = _ADAM7 if interlaced else ((0, 0, 1, 1),)
     sizes = [(-(-(height - y) // down), -(-(width - x) // across)) for x, y, across, down in passes]
     lines = [(rows, 1 + -(-columns * bits // 8)) for rows, columns in sizes if rows > 0 and columns > 0]
     total = sum(rows * length for rows, length in lines)
     unpack = zlib.decompressobj()
     try:
-        value = np.frombuffer(unpack.decompress(data, total), np.uint8)
+        value = np.frombuffer(unpack.decompress(packed, total), np.uint8)
         complete = len(value) == total and (unpack.decompress(unpack.unconsumed_tail, 1) or unpack.eof)
     except zlib.error as error:
-        return f"pixels that cannot be unpacked: {error}"
+        raise DamageError(f"pixels that cannot be unpacked: {error}") from error
     if not complete:
-        return f"{len(value)} bytes of pixels and no end of them, which must have {total}"
+        raise DamageError(f"{len(value)} bytes of pixels and no end of them, which must have {total}")
     first = 0
     for rows, length in lines:
         if (value[first : first + rows * length : length] > 4).any():
-            return "scan lines of an unknown filter"
+            raise DamageError("scan lines of an unknown filter")
         first += rows * length
-    return ""

@@ -14,6 +14,7 @@ import PIL.ImageCms
 import pytest
 
 from jaxprt.files import decode_image
+from tests.files.samples import planes, png_chunk, random_image, write_parts, write_tiles
 
 MUTATIONS = 200
 HEAD = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=2\nPRIMARIES=.64 .33 .29 .6 .15 .06 .333 .333\n\n-Y 12 +X 24\n"
@@ -80,36 +81,17 @@ print(json.dumps(results))
 """
 
 
-def write_exr(path, *parts):
-    made = [OpenEXR.Part({"type": OpenEXR.scanlineimage, **header}, channels, name) for name, header, channels in parts]
-    with OpenEXR.File(made) as file:
-        file.write(str(path))
-
-
-def write_tiles(path, image):
-    spec = OpenImageIO.ImageSpec(image.shape[1], image.shape[0], image.shape[2], "half")
-    spec.tile_width, spec.tile_height = 8, 8
-    output = OpenImageIO.ImageOutput.create("exr")
-    assert output is not None
-    assert output.open(str(path), spec)
-    assert output.write_image(image)
-    assert output.close()
-
-
 def write_sample(path):
     """A small valid file. Its name says the kind."""
-    image = np.random.default_rng(0).random((12, 24, 3)).astype(np.float32)
+    image = random_image(12, 24, 3)
     kind = path.stem
-    planes = {name: np.ascontiguousarray(image[..., i]) for i, name in enumerate("RGB")}
     if kind in ("zip", "piz", "dwaa", "b44", "pxr24", "rle"):
         compression = getattr(OpenEXR, f"{kind.upper()}_COMPRESSION")
-        write_exr(path, ("image", {"compression": compression, "chromaticities": AP0}, planes))
+        write_parts(path, image=(planes(image), {"compression": compression, "chromaticities": AP0}))
     elif kind == "parts":
-        depth = {"Z": planes["R"].copy()}
-        compression = {"compression": OpenEXR.ZIP_COMPRESSION}
-        write_exr(path, ("depth", dict(compression), depth), ("image", dict(compression), planes))
+        write_parts(path, depth=(planes(image, "Z"), {}), image=(planes(image), {}))
     elif kind == "tiles":
-        write_tiles(path, image)
+        write_tiles(path, image, (8, 8))
     elif kind == "flat":
         path.write_bytes(HEAD + PIXEL * 288)
     elif kind == "old_runs":
@@ -150,10 +132,6 @@ def test_mutated_files_are_read_or_refused_and_decoders_print_nothing(tmp_path, 
         assert counts["picture"] > 0, name
 
 
-def png_chunk(kind, data):
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-
 @pytest.mark.parametrize(
     ("chunks", "words"),
     [
@@ -167,6 +145,6 @@ def png_chunk(kind, data):
 def test_png_files_with_right_checksums_of_wrong_content_are_refused_without_a_line_of_libpng(capfd, chunks, words):
     header = (b"IHDR", struct.pack(">2I5B", 4, 4, 8, 2, 0, 0, 0))
     content = b"\x89PNG\r\n\x1a\n" + b"".join(png_chunk(*each) for each in (header, *chunks, (b"IEND", b"")))
-    with pytest.raises(ValueError, match=rf"a\.png must be an undamaged png file, got {words}"):
+    with pytest.raises(ValueError, match=rf"a\.png must be an undamaged png file, got: {words}"):
         decode_image(content, name="a.png")
     assert capfd.readouterr().err == ""

@@ -12,7 +12,8 @@ import OpenImageIO
 import pytest
 
 from jaxprt import require
-from jaxprt.files import decode_image, images, pixels, read_image, write_exr, write_png
+from jaxprt.files import decode_image, pixels, read_image, write_exr, write_png
+from tests.files.samples import encode_srgb, planes, png_chunk, random_image, write_parts, write_tiles
 
 AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.0770, 0.32168, 0.33767)
 # ACES2065-1 to linear sRGB with Bradford's adaptation, from the OpenColorIO configuration of ACES.
@@ -30,16 +31,8 @@ VALUE = {RED: [1.0, 0.5, 0.25], SKY: [0.5, 1.0, 4.0]}
 HEAD = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n"
 
 
-def random_image(*shape, seed=0):
-    return np.random.default_rng(seed).random(shape).astype(np.float32)
-
-
 def write_oiio(path, image, form):
     assert OpenImageIO.ImageBuf(np.ascontiguousarray(image)).write(str(path), form)
-
-
-def encode_srgb(value):
-    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
@@ -87,17 +80,6 @@ def test_truncated_files_are_refused_by_name(tmp_path, name):
         path.write_bytes(whole[:length])
         with pytest.raises(ValueError, match=name):
             read_image(path)
-
-
-@pytest.mark.parametrize("name", ["image.exr", "image.hdr", "image.png"])
-def test_noise_after_the_magic_bytes_is_refused(tmp_path, name):
-    path = tmp_path / name
-    image = random_image(64, 64, 3)
-    write_exr(path, image) if name.endswith("exr") else write_oiio(path, image, "uint8")
-    start = path.read_bytes()[:20]
-    path.write_bytes(start + np.random.default_rng(0).bytes(5000))
-    with pytest.raises(ValueError, match=name):
-        read_image(path)
 
 
 def test_content_counts_and_not_the_name(tmp_path):
@@ -167,10 +149,6 @@ def tagged(content, orientation, form):
         return content[:33] + png_chunk(b"eXIf", exif) + content[33:]
     block = b"Exif\0\0" + exif
     return content[:2] + b"\xff\xe1" + struct.pack(">H", len(block) + 2) + block + content[2:]
-
-
-def png_chunk(name, data):
-    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
 
 # Where the corners of the stored picture a b / c d are to be shown, from the table of Exif 2.32, section 4.6.4.
@@ -247,26 +225,26 @@ def test_reading_in_blocks_of_rows_gives_what_reading_at_once_gives(tmp_path, mo
     whole = read_image(path)[0]
     for values in (1, 31 * 3 * 7):
         monkeypatch.setattr(pixels, "_VALUES", values)
-        monkeypatch.setattr(images, "_LINES", 16)
         np.testing.assert_array_equal(read_image(path)[0], whole)
 
 
 def test_ctrl_c_interrupts_reading_between_blocks(tmp_path, monkeypatch):
     path = tmp_path / "image.png"
     write_png(path, random_image(50, 31, 3))
-    rows = []
+    lines, blocks = [], pixels.blocks
 
-    def interrupted(reader, block, **options):
-        rows.append(block)
-        if len(rows) == 3:
-            raise KeyboardInterrupt
-        return np.zeros((len(block), 31, 3), np.float32)
+    def interrupted(*reader, **options):
+        for rows, values in blocks(*reader, **options):
+            lines.append(rows)
+            if len(lines) == 3:
+                raise KeyboardInterrupt
+            yield rows, values
 
     monkeypatch.setattr(pixels, "_VALUES", 31 * 3 * 7)
-    monkeypatch.setattr(pixels, "read_block", interrupted)
+    monkeypatch.setattr(pixels, "blocks", interrupted)
     with pytest.raises(KeyboardInterrupt):
         read_image(path)
-    assert rows == [range(0, 7), range(7, 14), range(14, 21)]
+    assert lines == [range(0, 7), range(7, 14), range(14, 21)]
 
 
 def test_what_is_no_regular_file_is_refused(tmp_path):
@@ -315,26 +293,6 @@ def write_exr_channels(path, channels, **header):
         file.write(str(path))
 
 
-def planes(image, names="RGB", prefix=""):
-    return {prefix + name: np.ascontiguousarray(image[..., i]) for i, name in enumerate(names)}
-
-
-def write_parts(path, **parts):
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    made = [OpenEXR.Part(header | more, dict(channels), name) for name, (channels, more) in parts.items()]
-    with OpenEXR.File(made) as file:
-        file.write(str(path))
-
-
-def write_tiles(path, image, tile, form="half"):
-    spec = OpenImageIO.ImageSpec(image.shape[1], image.shape[0], image.shape[2], form)
-    spec.tile_width, spec.tile_height = tile
-    output = OpenImageIO.ImageOutput.create("exr")
-    assert output.open(str(path), spec)
-    assert output.write_image(np.ascontiguousarray(image))
-    assert output.close()
-
-
 def test_mip_mapped_tiles_are_read_at_the_finest_level(data):
     image, attributes = read_image(data / "env" / "KernerEnvCube.exr")
     assert image.shape == (1536, 256, 4)
@@ -344,7 +302,7 @@ def test_mip_mapped_tiles_are_read_at_the_finest_level(data):
 def test_tristimulus_values_do_not_pass_for_gray_and_a_depth_beside_gray_is_ignored(tmp_path):
     image = random_image(4, 6, 3)
     write_exr_channels(tmp_path / "xyz.exr", planes(image, "XYZ"))
-    with pytest.raises(ValueError, match=r"xyz\.exr must have .*, got X, Y, Z: convert CIE XYZ to RGB"):
+    with pytest.raises(ValueError, match=r"xyz\.exr must have .*, got X, Y, Z: convert CIE XYZ, or"):
         read_image(tmp_path / "xyz.exr")
     write_exr_channels(tmp_path / "depth.exr", planes(image, "YZ"))
     np.testing.assert_array_equal(read_image(tmp_path / "depth.exr")[0][..., 0], image[..., 0])
@@ -549,7 +507,8 @@ def read_free(path):
     return needed[-1]
 
 
-def test_rows_of_tall_tiles_count_before_they_are_read(tmp_path):
+def test_rows_of_tall_tiles_count_before_they_are_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(pixels, "_VALUES", 256 * 32 * 3)
     image = np.zeros((2048, 32, 3), np.float32)
     write_tiles(tmp_path / "flat.exr", image, (8, 8))
     write_tiles(tmp_path / "tall.exr", image, (8, 2048))
@@ -623,7 +582,7 @@ def test_old_runs_start_anew_in_each_line():
 )
 def test_runs_that_do_not_fill_the_lines_are_refused(data):
     with pytest.raises(
-        ValueError, match=r"sky\.hdr must be an undamaged hdr file, got pixels or runs .* 2 lines of 10"
+        ValueError, match=r"sky\.hdr must be an undamaged hdr file, got: pixels or runs .* 2 lines of 10"
     ):
         read(data, 10, 2)
 
@@ -769,7 +728,9 @@ def test_formats_and_resolutions_of_other_kinds_are_refused():
         with pytest.raises(ValueError, match=rf"sky\.hdr must hold RGB .*, got {form.decode()}: convert it first"):
             read(RED, 1, head=b"#?RADIANCE\nFORMAT=" + form + b"\n")
     for resolution in (b"-Y 1 +Y 1", b"-Y 1", b"", b"-Z 1 +X 1", b"-Y -1 +X 1", b"-Y 9999999999 +X 1", b"-Y 1 +X 1 1"):
-        with pytest.raises(ValueError, match=r"sky\.hdr must be an undamaged hdr file with a resolution"):
+        with pytest.raises(
+            ValueError, match=r"sky\.hdr must be an undamaged hdr file, got: .* resolution such as -Y 8 \+X 16"
+        ):
             read(RED, 1, resolution=resolution or b" ")
     for size in (b"-Y 0 +X 4", b"-Y 60000 +X 60000"):
         with pytest.raises(ValueError, match=r"sky\.hdr must have 1 to 268435456 pixels"):

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt.files import outputs, read_image, write_exr, write_png
+from jaxprt.files import outputs, pixels, read_image, write_exr, write_png
+from tests.files.samples import encode_srgb, random_image
 
 
 def test_the_new_file_replaces_the_old_one_at_the_end(tmp_path):
@@ -119,14 +120,6 @@ def test_a_disk_that_is_full_only_at_the_end_leaves_the_old_file(tmp_path, monke
     assert error.value.errno == 28
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def random_image(*shape, seed=0):
-    return np.random.default_rng(seed).random(shape).astype(np.float32)
-
-
-def encode_srgb(value):
-    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
 
 
 def test_exr_of_arrays_that_are_not_contiguous_or_not_numpy_is_written_rightly(tmp_path):
@@ -255,7 +248,7 @@ def test_directories_pipes_and_devices_are_not_replaced(tmp_path, write, suffix)
 
 
 def test_what_is_not_finite_and_large_images_are_written_in_blocks(tmp_path, monkeypatch):
-    monkeypatch.setattr(outputs, "_BLOCK", 1)
+    monkeypatch.setattr(pixels, "_VALUES", 1)
     image = random_image(50, 20, 3)
     image[3, 4], image[40, 2] = [np.nan, np.inf, -np.inf], [-1.0, 1e38, 1e-40]
     write_exr(tmp_path / "image.exr", image)

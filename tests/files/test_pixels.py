@@ -8,6 +8,7 @@ import PIL.ImageCms
 import pytest
 
 from jaxprt.files import decode_image, pixels, read_image, write_png
+from tests.files.samples import png_chunk
 
 D65, ACES_WHITE = (0.3127, 0.3290), (0.32168, 0.33767)
 # Published to four or more digits: the OpenColorIO configuration of ACES (AP0, AP1, with Bradford's adaptation),
@@ -54,17 +55,15 @@ def test_xyz_is_a_color_space_too():
     np.testing.assert_allclose(pixels.to_rec709((*xyz, 1 / 3, 1 / 3), "XYZ") @ np.ones(3), 1, rtol=1e-12)
 
 
-def chunk(name, data):
-    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
-
 def png(*chunks, bits=8):
     """A picture of 4 x 1 gray pixels of 0, 1/5, 3/5 and 1."""
     level = [0, 51, 153, 255]
     row = bytes([0, *level]) if bits == 8 else b"\0" + struct.pack(">4H", *(257 * value for value in level))
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 4, 1, bits, 0, 0, 0, 0))
-    data = chunk(b"IDAT", zlib.compress(row))
-    return b"\x89PNG\r\n\x1a\n" + header + b"".join(chunk(*each) for each in chunks) + data + chunk(b"IEND", b"")
+    header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", 4, 1, bits, 0, 0, 0, 0))
+    data = png_chunk(b"IDAT", zlib.compress(row))
+    return (
+        b"\x89PNG\r\n\x1a\n" + header + b"".join(png_chunk(*each) for each in chunks) + data + png_chunk(b"IEND", b"")
+    )
 
 
 LEVEL = np.array([0, 0.2, 0.6, 1])

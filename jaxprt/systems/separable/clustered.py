@@ -89,7 +89,7 @@ class ClusteredTransport(eqx.Module):
         most = (self.index.shape[1], *self.core.shape[1:])
         asked = {"count": count, "modes": modes, "components": components, "terms": terms}
         for (name, value), limit in zip(asked.items(), most, strict=True):
-            require.between(name, value, 1, limit)
+            require.count(name, limit if value is None else value, least=1, most=limit)
         index, mode = self.index[:, :count], self.mode[:, :count, :modes]
         core, weight = self.core[:, :modes, :components, :terms], self.weight[:, :, :components]
         rms = _rms(index, mode, core, weight, size=self.rms.shape[0])

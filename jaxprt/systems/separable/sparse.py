@@ -67,8 +67,8 @@ class SparseTransport(eqx.Module):
 
     def truncate(self, count: int, *, terms: int | None = None) -> "SparseTransport":
         """The transport with the `count` largest coefficients and the first `terms` terms (None: all)."""
-        require.between("count", count, 1, self.index.shape[0])
-        require.between("terms", terms, 1, self.terms)
+        require.count("count", count, least=1, most=self.index.shape[0])
+        require.count("terms", self.terms if terms is None else terms, least=1, most=self.terms)
         index, value = self.index[:count, :, :terms], self.value[:count, :, :terms]
         mark = None if self.mark is None else self.mark[:terms]
         size = rms(index, value, self.rms.shape[0])
