@@ -213,7 +213,7 @@ class MaterialReader:
             field["sheen_color"] = np.zeros(3, np.float32)
         self.ignored |= set(item.get("extensions", {}))
 
-    def _cover(self, item: dict[str, Any], alpha: np.ndarray, owner: str) -> dict[str, Any]:
+    def _cover(self, item: dict[str, Any], alpha: float, owner: str) -> dict[str, Any]:
         """What a material hides: its alpha, and its back (sections 3.9.4 and 3.9.5)."""
         back = "lit" if self._document.field(item, "doubleSided", owner, bool) else "hidden"
         mode = item.get("alphaMode", "OPAQUE")

@@ -549,25 +549,21 @@ def _geometry(document: Document, primitive: Primitive, weight: Sequence[float])
     else:
         used, face = _compact_vertices(face, len(primitive.attribute["POSITION"].value))
 
-    def values(key: str) -> np.ndarray | None:
-        if key not in primitive.attribute:
-            return None
-        value = primitive.attribute[key].numbers(used)
+    value: dict[str, np.ndarray] = {}
+    for key in [key for key in _ATTRIBUTES if key in primitive.attribute]:
+        if key == "TANGENT" and primitive.flat:
+            continue  # section 3.7.2.1: ignored without normals
+        value[key] = primitive.attribute[key].numbers(used)
         change = _morph_change(document, primitive, weight, key, used)
         if isinstance(change, np.ndarray):
-            width = min(value.shape[1], change.shape[1])
-            value[:, :width] += change[:, :width]
-        return value
-
-    position = values("POSITION")
-    assert position is not None
-    normal = _face_normals(position) if primitive.flat else values("NORMAL")
-    tangent = None if primitive.flat else values("TANGENT")  # section 3.7.2.1: ignored without normals
-    color = values("COLOR_0")
+            width = min(value[key].shape[1], change.shape[1])
+            value[key][:, :width] += change[:, :width]
+    position, tangent, color = value["POSITION"], value.get("TANGENT"), value.get("COLOR_0")
+    normal = _face_normals(position) if primitive.flat else value["NORMAL"]
     # In glTF v points down. Coordinates that are not finite count as missing.
     texture, second = (
         None if place is None else np.where(np.isfinite(place), [[0, 1]] + place * [[1, -1]], 0)
-        for place in (values("TEXCOORD_0"), values("TEXCOORD_1"))
+        for place in (value.get("TEXCOORD_0"), value.get("TEXCOORD_1"))
     )
     geometry = Geometry(
         position,

@@ -572,7 +572,7 @@ DAMAGE = {
         light=4
     ),
     r"must have a string for type of light 0, got 3": lambda _, lights: lights[0].update(type=3),
-    r"must have a finite number for the intensity of light 1, got inf": lambda _, lights: lights[1].update(
+    r"must have a finite number for intensity of light 1, got inf": lambda _, lights: lights[1].update(
         intensity=float("inf")
     ),
     r"must have an intensity and a color of at least 0 in light 0": lambda _, lights: lights[0].update(intensity=-1),
