@@ -175,7 +175,7 @@ TYPES = [
     ),
     (("materials", 0, "pbrMetallicRoughness", "baseColorFactor"), [1, 1, 1], "4 finite numbers for baseColorFactor"),
     (("materials", 0, "pbrMetallicRoughness", "roughnessFactor"), 1.5, r"be between 0 and 1, .* 1\.5"),
-    (("materials", 0, "normalTexture", "index"), 4, "one of its 1 textures in normalTexture of material 0"),
+    (("materials", 0, "normalTexture", "index"), 4, r"one of its 1 textures in \w+Texture of material 0"),
     (("cameras", 0, "perspective", "yfov"), 4, "must have yfov from 0 to pi"),
     (("asset", "version"), "1.0", "of version 2, got version 1.0"),
     (("extensionsRequired",), ["EXT_a", "EXT_b"], "must not require extensions other than .*, got EXT_a, EXT_b$"),
