@@ -1,8 +1,9 @@
 """Parts of scenes from files: images of textures, materials of files that have none, and one mesh for each material."""
 
+import functools
 import pathlib
 import warnings
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Hashable, Sequence
 
 import equinox as eqx
 import jax
@@ -18,11 +19,12 @@ from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.mesh import Mesh, brush, from_file, split
 from jaxprt.scene.scene import Part, unique_names
 
+FLIP = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])  # converts between v up and v down
 _GRAY = 0.5  # base color of surfaces without material and color
 
 
 def warn_of_ignored(source: object, ignored: Collection[str], *, stacklevel: int) -> None:
-    """Warns once of all that a file holds and that is not read; of nothing if there is nothing.
+    """Warns once of all that a file holds and that is not read, if there is anything.
 
     Args:
         source: The file.
@@ -34,33 +36,52 @@ def warn_of_ignored(source: object, ignored: Collection[str], *, stacklevel: int
         warnings.warn(f"{source}: not supported and ignored are {listed}", stacklevel=stacklevel + 1)
 
 
+class ImageError(ValueError):
+    """An image that cannot be decoded."""
+
+
 class TextureImages:
-    """Reads the image files of a scene. An image that several textures share is decoded and stored only once."""
+    """Reads the images of a scene. What several textures share is stored only once; damaged images are tried once."""
 
     def __init__(self):
-        self._image: dict[tuple[pathlib.Path, bool, tuple[int, ...]], jax.Array | ValueError] = {}
+        self._damaged: dict[tuple[Hashable, bool], ImageError] = {}
+        self._last: tuple[tuple[Hashable, bool] | None, np.ndarray] = None, np.zeros(0)  # for its other channels
+        self._channels: dict[tuple[Hashable, bool, tuple[int, ...]], jax.Array] = {}
 
-    def read(self, path: pathlib.Path, channels: tuple[int, ...], *, decoded: bool) -> jax.Array:
+    def channels(
+        self, key: Hashable, content: Callable[[], bytes], name: str, channels: tuple[int, ...], *, decoded: bool
+    ) -> jax.Array:
         """Some channels of an image.
 
         Args:
-            path: The file.
-            channels: Numbers of the channels. Of gray images, each is the gray.
+            key: What images that are equal have in common.
+            content: Reads the bytes of the image.
+            name: Name of the image for messages.
+            channels: Indices of the channels. Of gray images, each is the gray.
             decoded: Whether integers are decoded from sRGB.
+
+        Raises:
+            ImageError: The image cannot be decoded.
         """
+        if (key, decoded) in self._damaged:
+            raise self._damaged[key, decoded]
+        if (key, decoded, channels) not in self._channels:
+            if self._last[0] != (key, decoded):
+                self._last = None, np.zeros(0)
+                data = content()
+                try:
+                    self._last = (key, decoded), images.decode_image(data, name=name, decoded=decoded)
+                except ValueError as error:
+                    self._damaged[key, decoded] = ImageError(str(error))
+                    raise self._damaged[key, decoded] from error
+            self._channels[key, decoded, channels] = store_channels(self._last[1], channels, name)
+        return self._channels[key, decoded, channels]
+
+    def read(self, path: pathlib.Path, channels: tuple[int, ...], *, decoded: bool) -> jax.Array:
+        """Some channels of an image file."""
         inputs.check(path, "an image file")
-        key = path.resolve(), decoded, channels
-        if key not in self._image:
-            try:
-                pixels = images.decode_image(inputs.content(path, "an image file"), name=str(path), decoded=decoded)
-            except ValueError as error:
-                self._image[key] = error
-            else:
-                self._image[key] = store_channels(pixels, channels, str(path))
-        image = self._image[key]
-        if isinstance(image, ValueError):
-            raise ValueError(str(image)) from image
-        return image
+        content = functools.partial(inputs.content, path, "an image file")
+        return self.channels(path.resolve(), content, str(path), channels, decoded=decoded)
 
 
 def store_channels(image: np.ndarray, channels: tuple[int, ...], name: str) -> jax.Array:
@@ -105,7 +126,7 @@ def materials_of_images(
         outside: Whether images outside of the folder are read.
     """
     materials, ignored, pictures = [], set(content.ignored), TextureImages()
-    for name in content.images:
+    for name in content.names:
         material = plain
         if name is not None:
             owner = f"{path}, TextureFile"

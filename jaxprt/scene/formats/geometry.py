@@ -53,26 +53,23 @@ class MeshContent(NamedTuple):
 
     Attributes:
         geometry: The geometry. Colors are NaN where vertices have none.
-        images: Name of the image file of each region's base color; None where there is none.
+        names: Name of the image file of each region's base color, or of each region's material in OBJ files; None where
+            there is none.
         ignored: What the file holds and cannot be read, for a warning.
+        libraries: Names of the MTL files of an OBJ file.
+        comment: The first line of an OBJ file, which may name the program that wrote it.
     """
 
     geometry: Geometry
-    images: list[str | None]
+    names: list[str | None]
     ignored: set[str]
+    libraries: Sequence[str] = ()
+    comment: str = ""
 
 
-# Defaults for attributes that only some geometries have: shape per vertex, and value.
-_MISSING = {
-    "normal": ((3,), np.nan),
-    "tangent": ((3,), 0.0),
-    "handedness": ((), 1.0),
-    "texture": ((2,), 0.0),
-    "second": ((2,), 0.0),
-    "color": ((3,), 1.0),
-    "region": ((), 0.0),
-    "alpha": ((), 1.0),
-}
+# Shape per vertex and value of attributes where only some geometries have them.
+_MISSING = {"normal": ((3,), np.nan), "tangent": ((3,), 0.0), "handedness": ((), 1.0), "texture": ((2,), 0.0)}
+_MISSING |= {"second": ((2,), 0.0), "color": ((3,), 1.0), "region": ((), 0.0), "alpha": ((), 1.0)}
 
 
 def place(geometry: Geometry, matrix: np.ndarray) -> Geometry:
@@ -181,12 +178,7 @@ def join_geometries(geometries: Sequence[Geometry]) -> Geometry:
 
 
 def rows_of(region: np.ndarray, numbers: np.ndarray) -> list[np.ndarray]:
-    """Indices of the rows of each region, in ascending order. They are sorted once, whatever the number of regions.
-
-    Args:
-        region: Number of the region of each row.
-        numbers: The regions, in ascending order.
-    """
+    """Indices of the rows of each of `numbers`, regions in ascending order. Rows are sorted once for all regions."""
     order = np.argsort(region, kind="stable")
     return np.split(order, np.searchsorted(region[order], numbers[1:]))
 
@@ -204,27 +196,17 @@ def _column(geometries: Sequence[Geometry], name: str, shape: tuple[int, ...], v
 
 
 class Polygons(NamedTuple):
-    """Polygons of a file.
+    """Polygons of a file."""
 
-    Attributes:
-        corner: Vertex indices of all polygons, one polygon after the other [c].
-        size: Number of corners of each polygon [p].
-    """
-
-    corner: np.ndarray
-    size: np.ndarray
+    corner: np.ndarray  # vertex indices of all polygons, one polygon after the other [c]
+    size: np.ndarray  # number of corners of each polygon [p]
 
 
 class Triangles(NamedTuple):
-    """Triangles of polygons.
+    """Triangles of polygons."""
 
-    Attributes:
-        corner: Positions of the corners of each triangle in `Polygons.corner` [t 3].
-        polygon: Index of each triangle's polygon [t].
-    """
-
-    corner: np.ndarray
-    polygon: np.ndarray
+    corner: np.ndarray  # positions of the corners of each triangle in `Polygons.corner` [t 3]
+    polygon: np.ndarray  # index of the polygon of each triangle [t]
 
 
 def polygons_of_rows(row: np.ndarray) -> Polygons:
@@ -233,13 +215,9 @@ def polygons_of_rows(row: np.ndarray) -> Polygons:
 
 
 def check_polygons(polygons: Polygons, vertices: int, name: str) -> None:
-    """Refuses polygons that refer to vertices that do not exist.
-
-    Args:
-        polygons: The polygons.
-        vertices: Number of vertices.
-        name: Name of the file.
-    """
+    """Refuses polygons of the file `name` without a face, and those that refer to vertices that do not exist."""
+    if polygons.size.max(initial=0) < 3:
+        raise ValueError(f"{name} must hold vertices and faces, got no faces")
     wrong = (polygons.corner < 0) | (polygons.corner >= vertices)
     if wrong.any():
         end = np.cumsum(polygons.size)

@@ -8,26 +8,24 @@ multiply by 683 lm/W or another luminous efficacy, which a factor of 1 / 683 tak
 References in comments are to sections of the glTF 2.0 specification, https://registry.khronos.org/glTF/specs/2.0.
 """
 
+import functools
 import math
 import pathlib
 import warnings
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
-from jaxprt.files import images
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Sun
-from jaxprt.scene.formats import gltf_geometry, gltf_nodes
-from jaxprt.scene.formats.file_parts import split_parts, store_channels, warn_of_ignored
+from jaxprt.scene.formats import gltf_geometry, gltf_nodes, text
+from jaxprt.scene.formats.file_parts import FLIP, ImageError, TextureImages, split_parts, warn_of_ignored
 from jaxprt.scene.formats.gltf_file import (
     HONORED,
     Document,
     check_required,
     excerpt,
-    name_file_in_errors,
     unread_extensions,
 )
 from jaxprt.scene.formats.gltf_nodes import Node
@@ -39,6 +37,44 @@ _WIDEST = 64  # a larger aspect ratio is taken for damage
 _WRAP = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 _NEAREST = 9728
 _ALPHA_MODES = {"OPAQUE": "opaque", "MASK": "mask", "BLEND": "blend"}
+_COLORS = (0, 1, 2)
+_PBR = "pbrMetallicRoughness"
+# Factors of materials: the object that has each ("" for the material, or an extension), its name, and its default.
+_FACTORS: dict[str, tuple[str, str, float | tuple[float, ...]]] = {
+    "base_color": (_PBR, "baseColorFactor", (1.0, 1.0, 1.0, 1.0)),
+    "metallic": (_PBR, "metallicFactor", 1.0),
+    "roughness": (_PBR, "roughnessFactor", 1.0),
+    "emissive": ("", "emissiveFactor", (0.0, 0.0, 0.0)),
+    "normal_scale": ("normalTexture", "scale", 1.0),
+    "ior": ("ior", "ior", 1.5),
+    "specular": ("specular", "specularFactor", 1.0),
+    "specular_color": ("specular", "specularColorFactor", (1.0, 1.0, 1.0)),
+    "anisotropy": ("anisotropy", "anisotropyStrength", 0.0),
+    "rotation": ("anisotropy", "anisotropyRotation", 0.0),
+    "clearcoat": ("clearcoat", "clearcoatFactor", 0.0),
+    "clearcoat_roughness": ("clearcoat", "clearcoatRoughnessFactor", 0.0),
+    "sheen_color": ("sheen", "sheenColorFactor", (0.0, 0.0, 0.0)),
+    "sheen_roughness": ("sheen", "sheenRoughnessFactor", 0.0),
+    "transmission": ("transmission", "transmissionFactor", 0.0),
+}
+# Textures of materials: the object that has each, its name, its channels, and whether they are decoded from sRGB.
+_TEXTURES = {
+    "base_color_texture": (_PBR, "baseColorTexture", _COLORS, True),
+    "metallic_texture": (_PBR, "metallicRoughnessTexture", (2,), False),
+    "roughness_texture": (_PBR, "metallicRoughnessTexture", (1,), False),
+    "emissive_texture": ("", "emissiveTexture", _COLORS, True),
+    "specular_texture": ("specular", "specularTexture", (3,), False),
+    "specular_color_texture": ("specular", "specularColorTexture", _COLORS, True),
+    "anisotropy_texture": ("anisotropy", "anisotropyTexture", _COLORS, False),
+    "normal_texture": ("", "normalTexture", _COLORS, False),
+    "clearcoat_texture": ("clearcoat", "clearcoatTexture", (0,), False),
+    "clearcoat_roughness_texture": ("clearcoat", "clearcoatRoughnessTexture", (1,), False),
+    "sheen_color_texture": ("sheen", "sheenColorTexture", _COLORS, True),
+    "sheen_roughness_texture": ("sheen", "sheenRoughnessTexture", (3,), False),
+    "transmission_texture": ("transmission", "transmissionTexture", (0,), False),
+    "alpha_texture": (_PBR, "baseColorTexture", (3,), True),
+}
+_EXTENSIONS = ("ior", "specular", "anisotropy", "emissive_strength", "clearcoat", "sheen", "transmission")
 _SOURCES = ("KHR_texture_basisu", "EXT_texture_webp")
 _SHOWN = 80  # characters of a URI in warnings
 LIGHTS = "KHR_lights_punctual"
@@ -54,7 +90,7 @@ def read(
     lights: float = 1.0,
 ) -> Scene:
     """Reads the default scene of a glTF file, as `load_scene` documents."""
-    with name_file_in_errors(path):
+    with text.name_file_in_errors(path, "glTF"):
         document = Document(path, outside=outside)
         check_required(document, geometry=False)
         ignored = set() if time is None else gltf_nodes.pose(document, time, animation)
@@ -65,13 +101,15 @@ def read(
         names = [_name(document, index) for index in contents.material]
         parts = split_parts(contents.geometry, names, materials, path)
         ignored |= contents.ignored | reader.ignored | unread_extensions(document)
-        ignored |= {name for node in nodes for name in document.object(node.item, "extensions", f"node {node.number}")}
+        ignored |= {
+            name for node in nodes for name in document.field(node.item, "extensions", f"node {node.number}", dict)
+        }
         for index, material in zip(contents.material, materials, strict=True):
             if any((index, texture.set) in contents.lacking for texture in material.textures):
                 ignored |= {"textures of primitives without texture coordinates"}
         used = contents.geometry.position
         cameras, skipped = _cameras(document, nodes, (used.min(0) + used.max(0)) / 2)
-        point_lights, suns, unread_lights = read_lights(document, nodes, [part.name for part in parts], lights)
+        point_lights, suns, unread_lights = _lights(document, nodes, [part.name for part in parts], lights)
     ignored = (ignored | skipped | unread_lights) - HONORED
     warn_of_ignored(path, ignored, stacklevel=3)
     if suns:
@@ -96,9 +134,9 @@ def _cameras(document: Document, nodes: Sequence[Node], center: np.ndarray) -> t
             continue
         index = document.index("cameras", node.item["camera"], f"node {node.number}")
         item, owner = document.items("cameras")[index], f"camera {index}"
-        kind = document.string(item, "type", owner)
+        kind = document.field(item, "type", owner, str)
         if kind == "perspective":
-            perspective = document.object(item, "perspective", owner)
+            perspective = document.field(item, "perspective", owner, dict)
             cameras.append(_camera(document, perspective, owner, node.matrix, center))
         else:
             skipped.add(f"{kind} cameras" if kind == "orthographic" else f"cameras of type {excerpt(kind)}")
@@ -107,8 +145,7 @@ def _cameras(document: Document, nodes: Sequence[Node], center: np.ndarray) -> t
 
 def _camera(document: Document, item: dict[str, Any], owner: str, matrix: np.ndarray, center: np.ndarray) -> Camera:
     """A camera, transformed by its node. Its target is as far away as the center of the scene."""
-    angle = document.numbers(item.get("yfov"), (), f"yfov of {owner}")
-    aspect = document.numbers(item.get("aspectRatio", 1.0), (), f"aspectRatio of {owner}")
+    angle, aspect = (document.number(item, *field) for field in (("yfov", owner, None), ("aspectRatio", owner, 1.0)))
     if not 0 < angle < math.pi or not 0 < aspect < _WIDEST:
         required = f"must have yfov from 0 to pi and aspectRatio from 0 to {_WIDEST} in {owner}"
         raise document.error(required, f"{angle} and {aspect}")
@@ -132,231 +169,134 @@ class MaterialReader:
     def __init__(self, document: Document):
         self.ignored: set[str] = set()
         self._document = document
-        self._decoded: tuple[tuple[int, bool], np.ndarray] | None = None  # the last image, for its other channels
-        self._damaged: set[tuple[int, bool]] = set()
-        self._channels: dict[tuple[int, bool, tuple[int, ...]], jax.Array] = {}
+        self._images = TextureImages()
 
     def material(self, index: int | None) -> TexturedMaterial:
         """The material with an index; for None the default material of the specification."""
         if index is None:
             return TexturedMaterial(back="hidden")
-        owner = f"material {index}"
-        item = self._document.item("materials", index, owner)
-        extensions = self._document.object(item, "extensions", owner)
-        ior, specular, brushed, emissive = (
-            self._document.object(extensions, f"KHR_materials_{name}", owner)
-            for name in ("ior", "specular", "anisotropy", "emissive_strength")
-        )
-        pbr = self._document.object(item, "pbrMetallicRoughness", owner)
-        glow = self._number(item, "emissiveFactor", (0.0, 0.0, 0.0), owner)
-        glow = glow * self._number(emissive, "emissiveStrength", 1.0, owner)
-        normal = self._document.object(item, "normalTexture", owner)
-        self._note(item, owner)
+        document, owner = self._document, f"material {index}"
+        item = document.item("materials", index, owner)
+        holder = {"": item} | {key: document.field(item, key, owner, dict) for key in (_PBR, "normalTexture")}
+        holder |= {name: document.extension(item, f"KHR_materials_{name}", owner) for name in _EXTENSIONS}
         field: dict[str, Any] = {
-            "base_color": self._number(pbr, "baseColorFactor", (1.0, 1.0, 1.0, 1.0), owner)[:3],
-            "metallic": self._number(pbr, "metallicFactor", 1.0, owner),
-            "roughness": self._number(pbr, "roughnessFactor", 1.0, owner),
-            "emissive": self._document.numbers(
-                glow.tolist(), (3,), f"emissiveFactor times emissiveStrength of {owner}"
-            ),
-            "ior": self._number(ior, "ior", 1.5, owner),
-            "specular": self._number(specular, "specularFactor", 1.0, owner),
-            "specular_color": self._number(specular, "specularColorFactor", (1.0, 1.0, 1.0), owner),
-            "anisotropy": self._number(brushed, "anisotropyStrength", 0.0, owner),
-            "rotation": self._number(brushed, "anisotropyRotation", 0.0, owner),
-            "normal_scale": self._number(normal, "scale", 1.0, owner),
+            key: document.number(holder[name], factor, owner, default)
+            for key, (name, factor, default) in _FACTORS.items()
         }
-        colors = (0, 1, 2)
-        field |= {
-            "base_color_texture": self._texture(pbr, "baseColorTexture", colors, owner, decoded=True),
-            "metallic_texture": self._texture(pbr, "metallicRoughnessTexture", (2,), owner),
-            "roughness_texture": self._texture(pbr, "metallicRoughnessTexture", (1,), owner),
-            "emissive_texture": self._texture(item, "emissiveTexture", colors, owner, decoded=True),
-            "specular_texture": self._texture(specular, "specularTexture", (3,), owner),
-            "specular_color_texture": self._texture(specular, "specularColorTexture", colors, owner, decoded=True),
-            "anisotropy_texture": self._texture(brushed, "anisotropyTexture", colors, owner),
-            "normal_texture": self._texture(item, "normalTexture", colors, owner),
+        glow = field["emissive"] * document.number(holder["emissive_strength"], "emissiveStrength", owner, 1.0)
+        field["emissive"] = document.numbers(glow.tolist(), (3,), f"emissiveFactor times emissiveStrength of {owner}")
+        field["base_color"], alpha = field["base_color"][:3], field["base_color"][3]
+        self._note(item, holder["clearcoat"], field)
+        cover = self._cover(item, alpha, owner)
+        field |= cover | {
+            key: self._texture(holder[name], texture, channels, owner, decoded=decoded)
+            for key, (name, texture, channels, decoded) in _TEXTURES.items()
+            if key != "alpha_texture" or "alpha_mode" in cover
         }
-        field |= self._layers(extensions, owner)
-        field |= self._cover(item, pbr, owner)
         try:
             return TexturedMaterial(**field)
         except ValueError as error:
-            raise ValueError(f"{self._document.path}, {owner}: {error}") from error
+            raise ValueError(f"{document.path}, {owner}: {error}") from error
 
-    def _number(self, item: dict[str, Any], key: str, default: float | tuple[float, ...], owner: str) -> np.ndarray:
-        return self._document.numbers(item.get(key, default), np.shape(default), f"{key} of {owner}")
-
-    def _layers(self, extensions: dict[str, Any], owner: str) -> dict[str, Any]:
-        """The clear coat and the sheen of a material, and what passes through it."""
-        coat, fibers, passing = (
-            self._document.object(extensions, f"KHR_materials_{name}", owner)
-            for name in ("clearcoat", "sheen", "transmission")
-        )
+    def _note(self, item: dict[str, Any], coat: dict[str, Any], field: dict[str, Any]) -> None:
+        """Records unsupported features of a material, and removes its sheen under a clear coat."""
+        if "occlusionTexture" in item:
+            self.ignored.add("occlusion textures (occlusion is computed)")
         if "clearcoatNormalTexture" in coat:
             self.ignored.add("normal maps of clearcoats (a coat has the normals of its base)")
-        if passing.get("transmissionFactor", 0) != 0:
+        if field["transmission"]:
             self.ignored.add(
                 "refraction and blur of what is seen through transmitting surfaces (they are thin and clear)"
             )
-        field = {
-            "clearcoat": self._number(coat, "clearcoatFactor", 0.0, owner),
-            "clearcoat_roughness": self._number(coat, "clearcoatRoughnessFactor", 0.0, owner),
-            "sheen_color": self._number(fibers, "sheenColorFactor", (0.0, 0.0, 0.0), owner),
-            "sheen_roughness": self._number(fibers, "sheenRoughnessFactor", 0.0, owner),
-            "transmission": self._number(passing, "transmissionFactor", 0.0, owner),
-        }
-        if field["clearcoat"] and np.any(field["sheen_color"]):
+        if field["clearcoat"] and field["sheen_color"].any():
             self.ignored.add("sheens under clearcoats")
             field["sheen_color"] = np.zeros(3, np.float32)
-        return field | {
-            "clearcoat_texture": self._texture(coat, "clearcoatTexture", (0,), owner),
-            "clearcoat_roughness_texture": self._texture(coat, "clearcoatRoughnessTexture", (1,), owner),
-            "sheen_color_texture": self._texture(fibers, "sheenColorTexture", (0, 1, 2), owner, decoded=True),
-            "sheen_roughness_texture": self._texture(fibers, "sheenRoughnessTexture", (3,), owner),
-            "transmission_texture": self._texture(passing, "transmissionTexture", (0,), owner),
-        }
+        self.ignored |= set(item.get("extensions", {}))
 
-    def _cover(self, item: dict[str, Any], pbr: dict[str, Any], owner: str) -> dict[str, Any]:
+    def _cover(self, item: dict[str, Any], alpha: float, owner: str) -> dict[str, Any]:
         """What a material hides: its alpha, and its back (sections 3.9.4 and 3.9.5)."""
-        field: dict[str, Any] = {"back": "lit" if self._document.boolean(item, "doubleSided", owner) else "hidden"}
+        back = "lit" if self._document.field(item, "doubleSided", owner, bool) else "hidden"
         mode = item.get("alphaMode", "OPAQUE")
         # An alpha mode that the specification does not have counts as opaque.
         if not isinstance(mode, str) or mode not in _ALPHA_MODES:
             self.ignored.add(f"alpha mode {excerpt(mode)}")
-            return field
-        if mode == "OPAQUE":
-            return field
-        return field | {
-            "alpha_mode": _ALPHA_MODES[mode],
-            "alpha": self._number(pbr, "baseColorFactor", (1.0, 1.0, 1.0, 1.0), owner)[3],
-            "alpha_cutoff": self._number(item, "alphaCutoff", 0.5, owner) if mode == "MASK" else 0.5,
-            "alpha_texture": self._texture(pbr, "baseColorTexture", (3,), owner, decoded=True),
-        }
-
-    def _note(self, item: dict[str, Any], owner: str) -> None:
-        """Records unsupported features of a material."""
-        if "occlusionTexture" in item:
-            self.ignored.add("occlusion textures (occlusion is computed)")
-        self.ignored |= set(item.get("extensions", {}))
+        elif mode != "OPAQUE":
+            cutoff = self._document.number(item, "alphaCutoff", owner, 0.5) if mode == "MASK" else 0.5
+            return {"back": back, "alpha_mode": _ALPHA_MODES[mode], "alpha": alpha, "alpha_cutoff": cutoff}
+        return {"back": back}
 
     def _texture(
-        self, item: dict[str, Any], key: str, channels: tuple[int, ...], owner: str, *, decoded: bool = False
+        self, item: dict[str, Any], key: str, channels: tuple[int, ...], owner: str, *, decoded: bool
     ) -> Texture | None:
         """Some channels of a texture; None if there is no texture that can be read."""
         if key not in item:
             return None
         document = self._document
-        info, owner = document.object(item, key, owner), f"{key} of {owner}"
+        info, owner = document.field(item, key, owner, dict), f"{key} of {owner}"
         index = document.index("textures", info.get("index"), owner)
         texture, name = document.items("textures")[index], f"texture {index}"
-        extensions = document.object(info, "extensions", owner)
-        moved = document.object(extensions, "KHR_texture_transform", owner)
-        self.ignored |= extensions.keys()
-        number = document.integer({**info, **moved}, "texCoord", owner, 0)
+        moved = document.extension(info, "KHR_texture_transform", owner)
+        self.ignored |= info.get("extensions", {}).keys()
+        number = document.field({**info, **moved}, "texCoord", owner, int, 0)
         source = self._source(texture, name)
         if source is None or number > 1:
             self.ignored.add("textures without an image" if source is None else "third texture coordinates")
             return None
-        sampler = {}
-        if "sampler" in texture:
-            sampler = document.item("samplers", texture["sampler"], name)
+        sampler = document.item("samplers", texture["sampler"], name) if "sampler" in texture else {}
         if _NEAREST in (sampler.get("magFilter"), sampler.get("minFilter")):
             self.ignored.add("nearest filters (textures are interpolated)")
-        modes = [document.integer(sampler, side, name, 10497) for side in ("wrapS", "wrapT")]
+        modes = [document.field(sampler, side, name, int, 10497) for side in ("wrapS", "wrapT")]
         self.ignored |= {f"wrap mode {mode}" for mode in modes if mode not in _WRAP}
         across, up = (_WRAP.get(mode, "repeat") for mode in modes)
-        image = self._pixels(source, channels, name, decoded)
-        return None if image is None else Texture(image, self._transform(moved, owner), number, (across, up))
+        index = document.index("images", source, name)
+        image = document.items("images")[index]
+        label = f"image {index}" if "bufferView" in image else f"image {index}, {str(image.get('uri'))[:_SHOWN]}"
+        try:
+            pixels = self._images.channels(
+                index, functools.partial(document.image, index), label, channels, decoded=decoded
+            )
+        except (FileNotFoundError, ImageError) as error:
+            self.ignored.add(f"textures that cannot be read ({error})")
+            return None
+        return Texture(pixels, self._transform(moved, owner), number, (across, up))
 
     def _source(self, texture: dict[str, Any], name: str) -> Any:
         """The image of a texture: PNG or JPEG, or else that of an extension; None if there is none."""
         if "source" in texture:
             return texture["source"]
-        extensions = self._document.object(texture, "extensions", name)
-        used = (self._document.object(extensions, key, name).get("source") for key in _SOURCES if key in extensions)
+        used = (self._document.extension(texture, key, name).get("source") for key in _SOURCES)
         return next((source for source in used if source is not None), None)
-
-    def _pixels(self, source: Any, channels: tuple[int, ...], owner: str, decoded: bool) -> jax.Array | None:
-        """Channels of an image; None, with a record of the reason, if it cannot be decoded."""
-        index = self._document.index("images", source, owner)
-        key = (index, decoded, channels)
-        if key not in self._channels:
-            image = self._decode(index, owner, decoded)
-            if image is None:
-                return None
-            self._channels[key] = store_channels(image, channels, f"image {index}")
-        return self._channels[key]
-
-    def _decode(self, index: int, owner: str, decoded: bool) -> np.ndarray | None:
-        """The pixels of an image; None, with a record of the reason, if it cannot be decoded."""
-        key = index, decoded
-        if self._decoded is not None and self._decoded[0] == key:
-            return self._decoded[1]
-        if key in self._damaged:
-            return None
-        self._decoded = None
-        item = self._document.items("images")[index]
-        name = f"image {index}" if "bufferView" in item else f"image {index}, {str(item.get('uri'))[:_SHOWN]}"
-        try:
-            content = self._document.image(index, owner)
-        except FileNotFoundError as error:
-            return self._skip(key, error)
-        try:
-            image = images.decode_image(content, name=name, decoded=decoded)
-        except ValueError as error:
-            return self._skip(key, error)
-        self._decoded = key, image
-        return image
-
-    def _skip(self, key: tuple[int, bool], reason: Exception) -> None:
-        """Records why an image cannot be read."""
-        self.ignored.add(f"textures that cannot be read ({reason})")
-        self._damaged.add(key)
 
     def _transform(self, moved: dict[str, Any], owner: str) -> np.ndarray:
         """The affine transform of KHR_texture_transform, for texture coordinates with v up."""
-        (x, y), (across, down) = (
-            self._number(moved, key, default, owner) for key, default in (("offset", (0.0, 0.0)), ("scale", (1.0, 1.0)))
+        (x, y), (across, down), angle = (
+            self._document.number(moved, key, owner, default)
+            for key, default in (("offset", (0.0, 0.0)), ("scale", (1.0, 1.0)), ("rotation", 0.0))
         )
-        angle = self._number(moved, "rotation", 0.0, owner)
         cosine, sine = np.cos(angle), np.sin(angle)
         # For v down. "Counter-clockwise" holds as seen on the image; three.js and Blender's importer agree. The GLSL
         # code in the extension's text, read by columns, rotates the other way.
         matrix = np.array([[cosine * across, sine * down, x], [-sine * across, cosine * down, y], [0, 0, 1]])
-        flip = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
         with np.errstate(over="ignore"):  # textures refuse transforms that are not finite
-            return (flip @ matrix @ flip)[:2].astype(np.float32)
+            return (FLIP @ matrix @ FLIP)[:2].astype(np.float32)
 
 
-def read_lights(
+def _lights(
     document: Document, nodes: Sequence[Node], names: Sequence[str], scale: float
 ) -> tuple[list[PointLight], list[Sun], set[str]]:
-    """The lights of all nodes; none for a scale of 0.
-
-    Args:
-        document: The file.
-        nodes: The nodes of the default scene.
-        names: Names of the parts, which lights must not have.
-        scale: Units of radiance for one candela per square world unit.
-
-    Returns:
-        Point lights and spots, suns, and the names of what is not read.
-    """
+    """Point lights and spots, suns, and what is not read; none for a scale of 0. Parts have the `names`."""
     if scale == 0:
         return [], [], set()
     placed: list[tuple[dict[str, Any], str, Node]] = []
     ignored: set[str] = set()
-    items = document.array(_lights_extension(document, document.header, "the file"), "lights", LIGHTS)
+    items = document.field(document.extension(document.header, LIGHTS, "the file"), "lights", LIGHTS, list)
     for node in nodes:
-        extension = _lights_extension(document, node.item, f"node {node.number}")
+        extension = document.extension(node.item, LIGHTS, f"node {node.number}")
         if "light" not in extension:
             continue
-        number = extension["light"]
-        if type(number) is not int or not 0 <= number < len(items) or not isinstance(items[number], dict):
-            raise document.error(f"must refer to one of its {len(items)} lights in node {node.number}", excerpt(number))
+        number = document.index("lights", extension["light"], f"node {node.number}", items)
         item, owner = items[number], f"light {number}"
-        kind = document.string(item, "type", owner)
+        kind = document.field(item, "type", owner, str)
         if kind in ("point", "spot", "directional"):
             placed.append((item, owner, node))
         else:
@@ -367,8 +307,11 @@ def read_lights(
     unique = unique_names([*names, *labels])[len(names) :]
     points, suns = [], []
     for (item, owner, node), name in zip(placed, unique, strict=True):
-        color = document.numbers(item.get("color", [1.0] * 3), (3,), f"the color of {owner}")
-        strength = scale * color * document.numbers(item.get("intensity", 1.0), (), f"the intensity of {owner}")
+        color, intensity = (
+            document.number(item, "color", owner, (1.0,) * 3),
+            document.number(item, "intensity", owner, 1.0),
+        )
+        strength = scale * color * intensity
         if not (strength >= 0).all():
             raise document.error(f"must have an intensity and a color of at least 0 in {owner}", str(strength.tolist()))
         if item["type"] == "directional":
@@ -377,10 +320,6 @@ def read_lights(
             shape = _cone(document, item, node, owner) if item["type"] == "spot" else {}
             points.append(PointLight(name, node.matrix[:3, 3], np.float32(strength), **shape))
     return points, suns, ignored
-
-
-def _lights_extension(document: Document, item: dict[str, Any], owner: str) -> dict[str, Any]:
-    return document.object(document.object(item, "extensions", owner), LIGHTS, owner)
 
 
 def _light_axis(document: Document, node: Node, owner: str) -> np.ndarray:
@@ -394,9 +333,11 @@ def _light_axis(document: Document, node: Node, owner: str) -> np.ndarray:
 
 def _cone(document: Document, item: dict[str, Any], node: Node, owner: str) -> dict[str, Any]:
     """The axis and the angles of a spot."""
-    spot = document.object(item, "spot", owner)
-    inner = float(document.numbers(spot.get("innerConeAngle", 0.0), (), f"innerConeAngle of {owner}"))
-    outer = float(document.numbers(spot.get("outerConeAngle", np.pi / 4), (), f"outerConeAngle of {owner}"))
+    spot = document.field(item, "spot", owner, dict)
+    inner, outer = (
+        float(document.number(spot, f"{side}ConeAngle", owner, angle))
+        for side, angle in (("inner", 0.0), ("outer", np.pi / 4))
+    )
     if not 0 <= inner <= outer <= np.pi / 2 + 1e-6 or not outer > 0:  # float32 rounds pi / 2 upward
         must = f"must have innerConeAngle and outerConeAngle in ascending order from 0 to pi / 2 in {owner}"
         raise document.error(must, f"{inner:g} and {outer:g}")

@@ -12,8 +12,8 @@ import pathlib
 import re
 import struct
 import urllib.parse
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -52,6 +52,14 @@ _LOOK = "KHR_materials_"  # what a file looks like without these is named in a w
 _NOT_GEOMETRY = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "EXT_lights_")
 _COMPONENT = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+# What fields of each type must be, and their value if they are missing; None refuses what is missing.
+_KINDS: dict[type, tuple[str, Any]] = {
+    dict: ("an object", {}),
+    list: ("a list", []),
+    bool: ("true or false", False),
+    str: ("a string", None),
+    int: ("a whole number of at least 0", None),
+}
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942  # types of GLB chunks
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")  # of a URI that is not relative
 
@@ -67,12 +75,7 @@ class Header:
     """
 
     def __init__(self, path: pathlib.Path, text: bytes):
-        """Parses the header.
-
-        Args:
-            path: The file.
-            text: The JSON text; a byte order mark is allowed.
-        """
+        """Parses the JSON text of the header, which may start with a byte order mark."""
         self.path = path
         self._items: dict[str, list[dict[str, Any]]] = {}
         self._decoded = 0  # bytes
@@ -83,7 +86,7 @@ class Header:
         if not isinstance(header, dict):
             raise self.error("must be an undamaged glTF file with an object as its header", excerpt(header))
         self.header: dict[str, Any] = header
-        asset = self.object(header, "asset", "the file")
+        asset = self.field(header, "asset", "the file", dict)
         version = str(asset.get("version", "none"))
         if not version.startswith("2."):
             raise self.error("must be an undamaged glTF file of version 2", f"version {version[:_SHOWN]}")
@@ -91,7 +94,7 @@ class Header:
         if least != "2.0":
             raise self.error("must be a glTF file that needs no more than version 2.0", f"minVersion {least[:_SHOWN]}")
 
-    def error(self, required: str, got: str) -> ValueError:
+    def error(self, required: str, got: object) -> ValueError:
         """An error that names the file."""
         return ValueError(f"{self.path} {required}, got {got}")
 
@@ -102,69 +105,68 @@ class Header:
             must = f"must be an undamaged glTF file with a list of {kind}"
             if not isinstance(items, list):
                 raise self.error(must, type(items).__name__)
-            for number, item in enumerate(items):
+            for index, item in enumerate(items):
                 if not isinstance(item, dict):
-                    raise self.error(f"{must}, all of them objects", f"{excerpt(item)} at {number}")
+                    raise self.error(f"{must}, all of them objects", f"{excerpt(item)} at {index}")
             self._items[kind] = items
         return self._items[kind]
 
     def change(self, kind: str, fields: Mapping[int, Mapping[str, Any]]) -> None:
-        """Replaces fields of some objects of a kind, which the header itself keeps.
+        """Replaces fields of some objects of a kind, by their indices. The header itself keeps its fields."""
+        self._items[kind] = [{**item, **fields.get(index, {})} for index, item in enumerate(self.items(kind))]
 
-        Args:
-            kind: The kind, such as "nodes".
-            fields: New fields by the index of the object.
-        """
-        items = self.items(kind)
-        self._items[kind] = [{**item, **fields.get(number, {})} for number, item in enumerate(items)]
-
-    def index(self, kind: str, value: Any, owner: str) -> int:
-        """The index of an object of a kind.
-
-        Args:
-            kind: The kind, such as "meshes".
-            value: The index, read from the file and not checked yet.
-            owner: The object that refers to it, for error messages.
-        """
-        count = len(self.items(kind))
-        if not _is_whole(value) or not 0 <= value < count:
-            raise self.error(f"must refer to one of its {count} {kind} in {owner}", excerpt(value))
+    def index(self, kind: str, value: Any, owner: str, items: list | None = None) -> int:
+        """Checks the index of an object of a kind, such as "meshes", or of other `items`, to which `owner` refers."""
+        items = self.items(kind) if items is None else items
+        if not _is_whole(value) or not 0 <= value < len(items) or not isinstance(items[int(value)], dict):
+            raise self.error(f"must refer to one of its {len(items)} {kind} in {owner}", excerpt(value))
         return int(value)
 
     def item(self, kind: str, value: Any, owner: str) -> dict[str, Any]:
         """The object of a kind that has an index; arguments and errors are those of `index`."""
         return self.items(kind)[self.index(kind, value, owner)]
 
-    def object(self, item: dict[str, Any], key: str, owner: str) -> dict[str, Any]:
-        """A field that is an object; empty if it is missing."""
-        return self._field(item, key, owner, dict, "an object", {})
+    def field(self, item: Mapping[str, Any], key: str, owner: str, kind: type, default: Any = None) -> Any:
+        """A field of an object. A missing one has the default, or is empty or false, or is refused: see `_KINDS`.
 
-    def array(self, item: dict[str, Any], key: str, owner: str) -> list:
-        """A field that is a list; empty if it is missing."""
-        return self._field(item, key, owner, list, "a list", [])
+        Args:
+            item: The object.
+            key: Name of the field.
+            owner: Name of the object, for messages.
+            kind: dict, list, bool, str or int. Whole numbers must not be negative.
+            default: Value of a missing field; None for that of its kind.
+        """
+        must, missing = _KINDS[kind]
+        if default is None and missing is None and key not in item:
+            raise self.error("must be an undamaged glTF file", f"one that lacks {key!r} in {owner}")
+        value = item.get(key, missing if default is None else default)
+        if not (_is_whole(value) and 0 <= value <= _LARGEST if kind is int else isinstance(value, kind)):
+            raise self.error(f"must have {must} for {key} of {owner}", excerpt(value))
+        return int(value) if kind is int else value
 
-    def strings(self, item: dict[str, Any], key: str, owner: str) -> list[str]:
-        """A field that is a list of strings; empty if it is missing."""
-        values = self.array(item, key, owner)
+    def objects(self, item: Mapping[str, Any], key: str, owner: str, what: str) -> Iterator[tuple[str, dict[str, Any]]]:
+        """The objects of a field that is a list of them, each with its name, such as "channel 0 of animation 2"."""
+        for index, value in enumerate(self.field(item, key, owner, list)):
+            name = f"{what} {index} of {owner}"
+            if not isinstance(value, dict):
+                raise self.error(f"must have an object for {name}", excerpt(value))
+            yield name, value
+
+    def extension(self, item: Mapping[str, Any], key: str, owner: str) -> dict[str, Any]:
+        """An extension of an object; empty if it is missing."""
+        return self.field(self.field(item, "extensions", owner, dict), key, owner, dict)
+
+    def strings(self, key: str) -> list[str]:
+        """A field of the file that is a list of strings; empty if it is missing."""
+        values = self.field(self.header, key, "the file", list)
         for value in values:
             if not isinstance(value, str):
-                raise self.error(f"must have a list of strings for {key} of {owner}", f"{excerpt(value)} in it")
+                raise self.error(f"must have a list of strings for {key} of the file", f"{excerpt(value)} in it")
         return values
 
-    def string(self, item: dict[str, Any], key: str, owner: str) -> str:
-        """A field that is a string."""
-        return self._field(item, key, owner, str, "a string", None)
-
-    def boolean(self, item: dict[str, Any], key: str, owner: str) -> bool:
-        """A field that is true or false; false if it is missing."""
-        return self._field(item, key, owner, bool, "true or false", False)
-
-    def integer(self, item: dict[str, Any], key: str, owner: str, default: int | None = None) -> int:
-        """A field that is a whole number and not negative."""
-        value = self._present(item, key, owner) if default is None else item.get(key, default)
-        if not _is_whole(value) or not 0 <= value <= _LARGEST:
-            raise self.error(f"must have a whole number of at least 0 for {key} of {owner}", excerpt(value))
-        return int(value)
+    def number(self, item: Mapping[str, Any], key: str, owner: str, default: float | Sequence[float] | None) -> Any:
+        """A field that is a number, or a list of as many numbers as its default; None requires the field."""
+        return self.numbers(item.get(key, default), np.shape(0 if default is None else default), f"{key} of {owner}")
 
     def numbers(self, value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
         """Checks one number, or a list of numbers, and converts it to float64."""
@@ -189,17 +191,6 @@ class Header:
         self._decoded += size
         require.memory(f"the decoded data of {self.path}", self._decoded, "load a smaller scene")
 
-    def _field(self, item: dict[str, Any], key: str, owner: str, kind: type, name: str, default: Any) -> Any:
-        value = self._present(item, key, owner) if default is None else item.get(key, default)
-        if not isinstance(value, kind):
-            raise self.error(f"must have {name} for {key} of {owner}", excerpt(value))
-        return value
-
-    def _present(self, item: dict[str, Any], key: str, owner: str) -> Any:
-        if key not in item:
-            raise self.error("must be an undamaged glTF file", f"one that lacks {key!r} in {owner}")
-        return item[key]
-
 
 def excerpt(value: Any) -> str:
     """A value of a header for an error message, cut where it is long."""
@@ -212,34 +203,18 @@ def _is_whole(value: Any) -> bool:
     return type(value) is int or (type(value) is float and value.is_integer())
 
 
-def meshopt_extension(header: Header, view: dict[str, Any], name: str) -> dict[str, Any] | None:
-    """The extension of a buffer view; None if it is not compressed."""
-    extensions = header.object(view, "extensions", name)
-    used = [key for key in MESHOPT if key in extensions]
-    return header.object(extensions, used[0], name) if used else None
-
-
-def is_fallback(header: Header, buffer: dict[str, Any], name: str) -> bool:
+def _is_fallback(header: Header, buffer: dict[str, Any], name: str) -> bool:
     """Whether a buffer only stands in for compressed data and has no bytes."""
-    extensions = header.object(buffer, "extensions", name)
-    stated = any(header.object(extensions, key, name).get("fallback") is True for key in MESHOPT if key in extensions)
+    stated = any(header.extension(buffer, key, name).get("fallback") is True for key in MESHOPT)
     return stated and "uri" not in buffer
 
 
-def decode_meshopt(
+def _decode_meshopt(
     document: Header, view: dict[str, Any], extension: dict[str, Any], content: memoryview, name: str
 ) -> bytes:
-    """The bytes of a compressed buffer view.
-
-    Args:
-        document: The file.
-        view: The buffer view.
-        extension: The object of EXT_meshopt_compression in the buffer view.
-        content: The compressed bytes.
-        name: Name of the view, for messages.
-    """
+    """The bytes of the compressed buffer view `name`, whose extension is EXT_meshopt_compression."""
     owner = f"{MESHOPT[0]} of {name}" if MESHOPT[0] in view["extensions"] else f"{MESHOPT[1]} of {name}"
-    count, stride = (document.integer(extension, key, owner) for key in ("count", "byteStride"))
+    count, stride = (document.field(extension, key, owner, int) for key in ("count", "byteStride"))
     mode, words = extension.get("mode"), extension.get("filter", "NONE")
     if mode not in _MODES or words not in _FILTERS:
         must = f"must have one of the modes {', '.join(_MODES)} and of the filters {', '.join(_FILTERS)} in {owner}"
@@ -248,22 +223,28 @@ def decode_meshopt(
     if not right:
         must = "multiples of 4 up to 256 bytes" if mode == "ATTRIBUTES" else "2 or 4 bytes"
         raise document.error(f"must have elements of {must} in {owner}", f"{stride} bytes")
-    size = document.integer(view, "byteLength", name)
+    size = document.field(view, "byteLength", name, int)
     if count * stride != size:
         got = f"{count} elements of {stride} bytes"
         raise document.error(f"must have {size} decoded bytes in {owner}, as in the buffer view", got)
     document.decoding(size, len(content), owner, most=_MOST_DECODED)
-    try:
+    with needs_package("meshopt", document.path, owner):
         import meshopt
-    except ImportError as error:
-        raise ImportError(
-            f"{document.path} has compressed geometry ({owner}), which needs the package meshopt: "
-            "pip install 'jaxprt[web]'"
-        ) from error
     try:
         return meshopt.decode_gltf_buffer(bytes(content), count, stride, mode, words).tobytes()
     except (ValueError, RuntimeError) as error:
-        raise document.error(f"must have undamaged data of meshoptimizer in {owner}", str(error)) from error
+        raise document.error(f"must have undamaged data of meshoptimizer in {owner}", error) from error
+
+
+@contextlib.contextmanager
+def needs_package(package: str, path: pathlib.Path, owner: str) -> Iterator[None]:
+    """Says in the error of a missing package which compressed geometry needs it."""
+    try:
+        yield
+    except ImportError as error:
+        raise ImportError(
+            f"{path} has compressed geometry ({owner}), which needs the package {package}: pip install 'jaxprt[web]'"
+        ) from error
 
 
 def unread_extensions(header: Header) -> set[str]:
@@ -276,21 +257,12 @@ def unread_extensions(header: Header) -> set[str]:
 
 def stated_extensions(header: Header) -> set[str]:
     """Names of the extensions that a file says it uses or requires."""
-    return {
-        name
-        for key in ("extensionsUsed", "extensionsRequired")
-        for name in header.strings(header.header, key, "the file")
-    }
+    return {name for key in ("extensionsUsed", "extensionsRequired") for name in header.strings(key)}
 
 
 def check_required(header: Header, *, geometry: bool) -> None:
-    """Refuses a file that requires extensions that are not read.
-
-    Args:
-        header: The file.
-        geometry: Whether only the geometry is read, so that extensions of materials, textures and lights do not matter.
-    """
-    required = set(header.strings(header.header, "extensionsRequired", "the file"))
+    """Refuses a file that requires extensions that are not read; for `geometry`, only those of geometry."""
+    required = set(header.strings("extensionsRequired"))
     unknown = sorted(name for name in required - HONORED - _HARMLESS if not name.startswith(_LOOK))
     if geometry:
         unknown = [name for name in unknown if not name.startswith(_NOT_GEOMETRY)]
@@ -300,28 +272,20 @@ def check_required(header: Header, *, geometry: bool) -> None:
 
 
 class Elements(NamedTuple):
-    """The elements of an accessor, as they lie in the buffer. They are copied only where they are used.
+    """The elements of an accessor, as they lie in the buffer. They are copied only where they are used."""
 
-    Attributes:
-        value: The elements in their own type [count width].
-        place: Numbers of the elements that a sparse accessor replaces, in ascending order; may be empty.
-        replacement: What replaces them.
-        most: Largest value of normalized integers, which stands for 1; 0 for other numbers.
-    """
-
-    value: np.ndarray
-    place: np.ndarray
-    replacement: np.ndarray
-    most: int
+    value: np.ndarray  # in their own type [count width]
+    place: np.ndarray  # indices of elements that a sparse accessor replaces, in ascending order; may be empty
+    replacement: np.ndarray  # what replaces them
+    most: int  # largest value of normalized integers, which stands for 1; 0 for other numbers
 
     def rows(self, index: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Elements in their own type."""
         value = self.value[index]
         if len(self.place):
-            number = np.arange(len(self.value))[index] if isinstance(index, slice) else index
-            rank = np.searchsorted(self.place, number, side="right") - 1
-            replaced = (rank >= 0) & (self.place[np.maximum(rank, 0)] == number)
-            value = np.where(replaced[:, None], self.replacement[np.maximum(rank, 0)], value)
+            row = np.arange(len(self.value))[index] if isinstance(index, slice) else index
+            rank = np.maximum(np.searchsorted(self.place, row, side="right") - 1, 0)
+            value = np.where((self.place[rank] == row)[:, None], self.replacement[rank], value)
         return value
 
     def numbers(self, index: np.ndarray | slice = slice(None)) -> np.ndarray:
@@ -332,27 +296,18 @@ class Elements(NamedTuple):
 
 
 class Form(NamedTuple):
-    """The header of an accessor.
+    """The header of an accessor."""
 
-    Attributes:
-        item: The JSON object.
-        name: Name for messages.
-        dtype: Type of the numbers.
-        rows: Number of elements.
-        width: Numbers of an element.
-        most: Largest value of normalized integers, which stands for 1; 0 for other numbers.
-    """
-
-    item: dict[str, Any]
-    name: str
+    item: dict[str, Any]  # the JSON object
+    name: str  # for messages
     dtype: np.dtype
-    rows: int
-    width: int
-    most: int
+    rows: int  # number of elements
+    width: int  # numbers of an element
+    most: int  # that of `Elements`
 
 
 class Document(Header):
-    """A glTF file. Its objects are looked up by index; errors name the file and the object."""
+    """A glTF file with its data. Errors name the file and the object."""
 
     def __init__(self, path: pathlib.Path, *, outside: bool = False):
         """Reads the header and the binary chunk of a GLB. Other files are read when they are needed.
@@ -377,7 +332,7 @@ class Document(Header):
         index = self.index("bufferViews", value, owner)
         if index not in self._view:
             item, name = self.items("bufferViews")[index], f"buffer view {index}"
-            self._view[index] = self._part(item, name), self.integer(item, "byteStride", name, 0)
+            self._view[index] = self._decompressed(item, name), self.field(item, "byteStride", name, int, 0)
         return self._view[index]
 
     def accessor(self, value: Any, owner: str, *widths: int, whole: bool = False) -> Elements:
@@ -401,36 +356,32 @@ class Document(Header):
             array = np.broadcast_to(np.zeros((1, width), dtype), (count, width))
         place, replacement = np.zeros(0, np.int64), array[:0]
         if "sparse" in item:
-            place, replacement = self._sparse(self.object(item, "sparse", name), name, array)
+            place, replacement = self._sparse(self.field(item, "sparse", name, dict), name, array)
         return Elements(array, place, replacement, most)
 
     def form(self, value: Any, owner: str, *widths: int, whole: bool = False) -> Form:
         """The header of an accessor; arguments and errors are those of `accessor`. No data are read."""
         index = self.index("accessors", value, owner)
         item, name = self.items("accessors")[index], f"accessor {index} ({owner})"
-        kind, form = self.integer(item, "componentType", name), self.string(item, "type", name)
-        count, width = self.integer(item, "count", name), _WIDTH.get(form, 0)
+        kind, form = self.field(item, "componentType", name, int), self.field(item, "type", name, str)
+        count, width = self.field(item, "count", name, int), _WIDTH.get(form, 0)
         if width not in widths or kind not in _COMPONENT or (whole and kind == 5126):
             must = f"must have {' or '.join(map(str, widths))} {'whole ' if whole else ''}numbers per element"
             raise self.error(f"{must} in {name}", f"type {excerpt(form)} of component type {kind}")
         if count < 1:
-            raise self.error(f"must have 1 or more elements in {name}", str(count))
+            raise self.error(f"must have 1 or more elements in {name}", count)
         dtype = np.dtype(_COMPONENT[kind])
-        normalized = self.boolean(item, "normalized", name) and dtype.kind in "iu"
+        normalized = self.field(item, "normalized", name, bool) and dtype.kind in "iu"
         return Form(item, name, dtype, count, width, int(np.iinfo(dtype).max) if normalized else 0)
 
-    def image(self, value: Any, owner: str) -> bytes:
+    def image(self, index: int) -> bytes:
         """The bytes of an image, embedded or in a separate file."""
-        index = self.index("images", value, owner)
         item, name = self.items("images")[index], f"image {index}"
         if "bufferView" in item:
             return bytes(self.view(item["bufferView"], name)[0])
         uri = item.get("uri")
-        if isinstance(uri, str) and uri and not _is_embedded(uri):
-            path = self._file(uri, name)
-            absence = inputs.absence(path)
-            if absence:
-                raise FileNotFoundError(f"{name}, {path}, {absence}")
+        if _names_file(uri) and (absence := inputs.absence(path := self._file(uri, name))):
+            raise FileNotFoundError(f"{name}, {path}, {absence}")
         return self._resource(uri, name)
 
     @functools.cached_property
@@ -438,8 +389,7 @@ class Document(Header):
         """Bytes of the file and of the files of its buffers, which are not read. Missing ones count as empty."""
         sizes: dict[pathlib.Path, int] = {}
         for number, item in enumerate(self.items("buffers")):
-            uri = item.get("uri")
-            if isinstance(uri, str) and uri and not _is_embedded(uri):
+            if _names_file(uri := item.get("uri")):
                 with contextlib.suppress(OSError, ValueError):  # raised where the buffer is used
                     path = self._file(uri, f"buffer {number}")
                     inputs.check(path, "a buffer")
@@ -450,12 +400,10 @@ class Document(Header):
         """The header and the binary chunk of a GLB (section 4)."""
         must = "must be an undamaged GLB file"
         if content[:4] != b"glTF":
-            raise self.error(
-                f"{must}, which starts with the text glTF",
-                f"the bytes {content[:4].hex(' ')}" if content else "an empty file",
-            )
+            got = f"the bytes {content[:4].hex(' ')}" if content else "an empty file"
+            raise self.error(f"{must}, which starts with the text glTF", got)
         if len(content) < 20:
-            raise self.error(f"{must} of at least 20 bytes, its two headers", f"{len(content)}")
+            raise self.error(f"{must} of at least 20 bytes, its two headers", len(content))
         version, length, size, kind = struct.unpack_from("<4I", content, 4)
         if version != 2:
             raise self.error(f"{must} of version 2", f"version {version}")
@@ -470,23 +418,22 @@ class Document(Header):
             place += 8 + extent
         return content[20 : 20 + size], binary
 
-    def _part(self, view: dict[str, Any], name: str) -> memoryview:
+    def _decompressed(self, view: dict[str, Any], name: str) -> memoryview:
         """The bytes of a buffer view. Compressed views are decoded where they have no uncompressed fallback."""
         index = self.index("buffers", view.get("buffer"), name)
-        extension = meshopt_extension(self, view, name)
-        if extension is None:
-            return self._cut(view, name)
-        here = "uri" in self.items("buffers")[index] or (index == 0 and self._chunk is not None)
-        if here and not is_fallback(self, self.items("buffers")[index], f"buffer {index}"):
+        buffer, used = self.items("buffers")[index], self.field(view, "extensions", name, dict)
+        extension = next((self.field(used, key, name, dict) for key in MESHOPT if key in used), None)
+        here = "uri" in buffer or (index == 0 and self._chunk is not None)
+        if extension is None or (here and not _is_fallback(self, buffer, f"buffer {index}")):
             return self._cut(view, name)
         content = self._cut(extension, f"the compressed data of {name}")
-        return memoryview(decode_meshopt(self, view, extension, content, name))
+        return memoryview(_decode_meshopt(self, view, extension, content, name))
 
     def _cut(self, item: dict[str, Any], name: str) -> memoryview:
         """The bytes of a buffer that an object names."""
         content = self._bytes(self.index("buffers", item.get("buffer"), name))
-        start = self.integer(item, "byteOffset", name, 0)
-        end = start + self.integer(item, "byteLength", name)
+        start = self.field(item, "byteOffset", name, int, 0)
+        end = start + self.field(item, "byteLength", name, int)
         if end > len(content):
             got = f"{len(content)} bytes in buffer {item['buffer']}"
             raise self.error(f"must have buffers of at least {end} bytes for {name}", got)
@@ -502,7 +449,7 @@ class Document(Header):
                 content = self._chunk
             else:
                 raise self.error(f"must have the bytes of {name}", "neither a file nor a binary chunk")
-            length = self.integer(item, "byteLength", name)
+            length = self.field(item, "byteLength", name, int)
             if len(content) < length:
                 raise self.error(f"must have {length} bytes in {name}", f"{len(content)} bytes")
             self._buffer[index] = content
@@ -512,7 +459,7 @@ class Document(Header):
         """The data of a URI: embedded in it, or in a file relative to the glTF file."""
         if not isinstance(uri, str) or not uri:
             raise self.error(f"must name a file or hold data in {owner}", excerpt(uri))
-        if _is_embedded(uri):
+        if not _names_file(uri):
             kind, _, data = uri.partition(",")
             plain = urllib.parse.unquote_to_bytes(data)
             try:
@@ -525,14 +472,13 @@ class Document(Header):
         """The path of the file that a URI names."""
         if _SCHEME.match(uri):
             raise self.error(f"must name a file beside it in {owner}", excerpt(uri))
-        name, folder = urllib.parse.unquote(uri), self.path.parent
-        owner_name = f"{self.path}, {owner}"
-        return inputs.reference(name, folder, folder=folder, owner=owner_name, outside=self._outside)
+        name, folder, owner = urllib.parse.unquote(uri), self.path.parent, f"{self.path}, {owner}"
+        return inputs.reference(name, folder, folder=folder, owner=owner, outside=self._outside)
 
     def _strided(self, item: dict[str, Any], name: str, dtype: np.dtype, shape: tuple[int, int]) -> np.ndarray:
         """The elements of a buffer view, without a copy."""
         content, stride = self.view(item.get("bufferView"), name)
-        offset, size = self.integer(item, "byteOffset", name, 0), dtype.itemsize * shape[1]
+        offset, size = self.field(item, "byteOffset", name, int, 0), dtype.itemsize * shape[1]
         stride = stride or size
         end = offset + stride * (shape[0] - 1) + size
         if stride < size or end > len(content):
@@ -544,8 +490,8 @@ class Document(Header):
 
     def _sparse(self, item: dict[str, Any], name: str, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Numbers of the elements that a sparse accessor replaces, and what replaces them (section 3.6.2.3)."""
-        indices, values = self.object(item, "indices", name), self.object(item, "values", name)
-        count, kind = self.integer(item, "count", name), self.integer(indices, "componentType", name)
+        indices, values = self.field(item, "indices", name, dict), self.field(item, "values", name, dict)
+        count, kind = self.field(item, "count", name, int), self.field(indices, "componentType", name, int)
         if not 0 < count <= len(value) or kind not in (5121, 5123, 5125):
             got = f"{count} of component type {kind}"
             raise self.error(f"must replace 1 to {len(value)} elements, numbered by unsigned integers, in {name}", got)
@@ -556,24 +502,6 @@ class Document(Header):
         return place[order], self._strided(values, name, value.dtype, (count, value.shape[1]))[order]
 
 
-def _is_embedded(uri: str) -> bool:
-    """Whether a URI holds the data itself."""
-    return uri[:5].lower() == "data:"
-
-
-@contextlib.contextmanager
-def name_file_in_errors(path: pathlib.Path) -> Iterator[None]:
-    """Makes all errors that a damaged file causes name the file."""
-    must = f"{path} must be an undamaged glTF file"
-    try:
-        yield
-    except KeyError as error:
-        raise ValueError(f"{must}, got one that lacks {error} where it is needed") from error
-    except (IndexError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise ValueError(f"{must}, got one that cannot be read: {type(error).__name__}: {error}") from error
-    except (ValueError, MemoryError) as error:
-        if str(path) in str(error):
-            raise
-        if isinstance(error, MemoryError):
-            raise MemoryError(f"{path}: {error}") from error
-        raise ValueError(f"{must}, got one that cannot be read: {error}") from error
+def _names_file(uri: Any) -> TypeGuard[str]:
+    """Whether a URI names a file. Others hold the data, or are none."""
+    return isinstance(uri, str) and bool(uri) and uri[:5].lower() != "data:"

@@ -17,7 +17,7 @@ from jaxprt.scene.formats.gltf_file import (
     Document,
     Elements,
     check_required,
-    excerpt,
+    needs_package,
     stated_extensions,
 )
 from jaxprt.scene.formats.gltf_nodes import Node, instance_count, joint_transforms, nodes
@@ -42,32 +42,17 @@ _ABOVE_1 = 1.01  # colors up to here are 1 and rounding
 _VERTEX, _JOINTS, _FACE, _PART = 300, 350, 70, 3000
 
 
-class Binding(NamedTuple):
-    """The joints of vertices.
-
-    Attributes:
-        joint: Numbers of joints in the skin [v k].
-        weight: Weights of the joints [v k].
-    """
+class _Binding(NamedTuple):
+    """The joints of vertices: their indices in the skin [v k], and their weights [v k]."""
 
     joint: np.ndarray
     weight: np.ndarray
 
 
-def skin_binding(
+def _skin_binding(
     document: Document, attribute: dict[str, Elements], sets: int, used: np.ndarray, name: str
-) -> Binding | None:
-    """The joints of the used vertices of a primitive, from JOINTS_n and WEIGHTS_n (section 3.7.3.3).
-
-    Weights are scaled to a sum of 1. A vertex without weights follows its first joint.
-
-    Args:
-        document: The file.
-        attribute: Attributes of the primitive.
-        sets: Number of sets of joints; 0 gives None.
-        used: Indices of the used vertices.
-        name: Name of the primitive, for messages.
-    """
+) -> _Binding | None:
+    """The joints of the used vertices of a primitive (section 3.7.3.3), by weights that sum to 1; None without sets."""
     if not sets:
         return None
     joint = np.concatenate([attribute[f"JOINTS_{number}"].rows(used) for number in range(sets)], 1).astype(np.int64)
@@ -77,28 +62,22 @@ def skin_binding(
         got = f"{len(wrong)} of {len(weight)} vertices without, the first has {weight[wrong[0]].tolist()}"
         raise document.error(f"must have weights of joints of at least 0 in {name}", got)
     total = weight.sum(1, keepdims=True)
-    first = np.eye(1, weight.shape[1])
-    return Binding(joint, np.where(total > 0, weight / np.where(total > 0, total, 1), first))
+    first = np.eye(1, weight.shape[1])  # a vertex without weights follows its first joint
+    return _Binding(joint, np.where(total > 0, weight / np.where(total > 0, total, 1), first))
 
 
-def skin_joints(document: Document, skin: int) -> list[int]:
+def _skin_joints(document: Document, skin: int) -> list[int]:
     """Indices of the nodes that are the joints of a skin."""
     item, owner = document.items("skins")[skin], f"skin {skin}"
-    named = [document.index("nodes", joint, owner) for joint in document.array(item, "joints", owner)]
-    if not named:
+    joints = [document.index("nodes", joint, owner) for joint in document.field(item, "joints", owner, list)]
+    if not joints:
         raise document.error(f"must have one or more joints in {owner}", "none")
-    return named
+    return joints
 
 
-def joint_matrices(document: Document, skin: int, world: dict[int, np.ndarray]) -> np.ndarray:
-    """Transforms from the space of a mesh to world coordinates, one for each joint of a skin [j 4 4] (section 3.7.3).
-
-    Args:
-        document: The file.
-        skin: Index of the skin.
-        world: World transforms of nodes by their indices.
-    """
-    item, owner, named = document.items("skins")[skin], f"skin {skin}", skin_joints(document, skin)
+def _joint_matrices(document: Document, skin: int, world: dict[int, np.ndarray]) -> np.ndarray:
+    """Transforms from a mesh to world coordinates, one for each joint of a skin [j 4 4] (section 3.7.3)."""
+    item, owner, named = document.items("skins")[skin], f"skin {skin}", _skin_joints(document, skin)
     for joint in named:
         if joint not in world:
             raise document.error(f"must have joints of {owner} that belong to trees of nodes", f"node {joint}")
@@ -108,7 +87,7 @@ def joint_matrices(document: Document, skin: int, world: dict[int, np.ndarray]) 
     inverse = document.accessor(item["inverseBindMatrices"], f"inverseBindMatrices of {owner}", 16)
     if len(inverse.value) < len(named):
         must = f"must have an inverse bind matrix for each of the {len(named)} joints of {owner}"
-        raise document.error(must, str(len(inverse.value)))
+        raise document.error(must, len(inverse.value))
     columns = inverse.numbers(slice(len(named))).reshape(-1, 4, 4)
     if not np.isfinite(columns).all():
         raise document.error(f"must have finite inverse bind matrices in {owner}", "others")
@@ -116,18 +95,8 @@ def joint_matrices(document: Document, skin: int, world: dict[int, np.ndarray]) 
         return matrix @ columns.transpose(0, 2, 1)
 
 
-def apply_skin(document: Document, geometry: Geometry, bound: Binding, matrices: np.ndarray, name: str) -> Geometry:
-    """A geometry in world coordinates, each vertex moved by the weighted mean of the transforms of its joints.
-
-    Normals are transformed by the cofactors of this mean. Where it mirrors, faces are flipped.
-
-    Args:
-        document: The file.
-        geometry: The geometry in the space of its mesh.
-        bound: The joints of its vertices.
-        matrices: Transforms of the joints [j 4 4].
-        name: Name of the primitive, for messages.
-    """
+def _apply_skin(document: Document, geometry: Geometry, bound: _Binding, matrices: np.ndarray, name: str) -> Geometry:
+    """A geometry in world coordinates: vertices are moved by the weighted means of transforms of joints [j 4 4]."""
     joint, weight = bound
     far = np.flatnonzero((((joint < 0) | (joint >= len(matrices))) & (weight > 0)).any(1))
     if far.size:
@@ -139,7 +108,7 @@ def apply_skin(document: Document, geometry: Geometry, bound: Binding, matrices:
         for column in range(joint.shape[1]):
             mean += weight[:, column, None, None] * matrices[joint[:, column], :3]
         linear = mean[:, :, :3]
-        cofactor = cofactors(linear)
+        cofactor = cofactors(linear)  # which transforms normals; where it mirrors, faces are flipped
         side = np.where((linear[:, 0] * cofactor[:, 0]).sum(1) < 0, -1.0, 1.0)
         turned = geometry._replace(position=_transform(linear, geometry.position) + mean[:, :, 3])
         if geometry.normal is not None:
@@ -157,15 +126,8 @@ def _transform(linear: np.ndarray, vector: np.ndarray) -> np.ndarray:
     return np.einsum("vij,vj->vi", linear, vector)
 
 
-def morph_weights(document: Document, node: Node, mesh: int, count: int) -> tuple[float, ...]:
-    """The weights of the morph targets of a node's mesh: those of the node, or else of the mesh, or else 0.
-
-    Args:
-        document: The file.
-        node: The node.
-        mesh: Index of its mesh.
-        count: Number of targets of the mesh.
-    """
+def _morph_weights(document: Document, node: Node, mesh: int, count: int) -> tuple[float, ...]:
+    """The weights of the `count` morph targets of a node's mesh: those of the node, or else of the mesh, or else 0."""
     if not count:
         return ()
     for item, owner in ((node.item, f"node {node.number}"), (document.items("meshes")[mesh], f"mesh {mesh}")):
@@ -175,77 +137,53 @@ def morph_weights(document: Document, node: Node, mesh: int, count: int) -> tupl
     return (0.0,) * count
 
 
-def morph_change(
-    document: Document,
-    targets: Sequence[Any],
-    weight: Sequence[float],
-    *,
-    key: str,
-    used: np.ndarray,
-    count: int,
-    name: str,
+def _morph_change(
+    document: Document, primitive: "Primitive", weight: Sequence[float], key: str, used: np.ndarray
 ) -> np.ndarray | float:
-    """What the morph targets of a primitive add to one attribute of some vertices. Targets of weight 0 are not read.
-
-    Args:
-        document: The file.
-        targets: The targets, as they stand in the file; may be empty.
-        weight: Weights of the targets.
-        key: Name of the attribute.
-        used: Indices of the vertices.
-        count: Number of vertices of the primitive.
-        name: Name of the primitive, for messages.
-    """
+    """What the morph targets of a primitive add to one attribute of used vertices. Those of weight 0 are not read."""
+    targets, name, count = primitive.targets, primitive.name, len(primitive.attribute["POSITION"].value)
     if not targets:
         return 0.0
     if len(targets) != len(weight):
         raise document.error(f"must have {len(weight)} morph targets in {name}, as in its mesh", str(len(targets)))
     total: np.ndarray | float = 0.0
-    for number, (target, share) in enumerate(zip(targets, weight, strict=True)):
-        owner = f"morph target {number} of {name}"
-        if not isinstance(target, dict):
-            raise document.error(f"must have an object for {owner}", excerpt(target))
+    named = document.objects({"targets": targets}, "targets", name, "morph target")
+    for (owner, target), share in zip(named, weight, strict=True):
         if not share or key not in target:
             continue
         elements = document.accessor(target[key], f"{key} of {owner}", *_MORPHS[key])
         if len(elements.value) != count:
-            got = str(len(elements.value))
-            raise document.error(f"must have {count} elements in {key} of {owner}, as in POSITION", got)
-        elements = _normalized(document, elements, key)
-        difference = elements.numbers(used)
-        if not np.isfinite(difference).all():
-            wrong = np.flatnonzero(~np.isfinite(difference).all(1))
+            must = f"must have {count} elements in {key} of {owner}, as in POSITION"
+            raise document.error(must, len(elements.value))
+        difference = _normalized(document, elements, key).numbers(used)
+        wrong = np.flatnonzero(~np.isfinite(difference).all(1))
+        if wrong.size:
             got = f"{len(wrong)} of {len(used)} that are not, the first at vertex {used[wrong[0]]}"
             raise document.error(f"must have finite numbers in {key} of {owner}", got)
         total = total + share * difference
     return total
 
 
-class DracoReader:
+class _DracoReader:
     """Decodes the compressed primitives of a file. Primitives that share a buffer view are decoded once."""
 
     def __init__(self, document: Document):
         self._document = document
         self._mesh: dict[int, Any] = {}
 
-    def primitive(self, item: dict[str, Any], name: str) -> dict[str, Elements] | None:
-        """The compressed attributes of a primitive, and its "indices"; None if all its accessors have data.
-
-        Args:
-            item: The primitive.
-            name: Name of the primitive, for messages.
-        """
+    def primitive(self, item: dict[str, Any], name: str) -> dict[str, Elements]:
+        """The compressed attributes of a primitive, and its "indices"; empty if all its accessors have data."""
         document = self._document
-        extensions = document.object(item, "extensions", name)
+        extensions = document.field(item, "extensions", name, dict)
         if DRACO not in extensions:
-            return None
-        attribute = document.object(item, "attributes", name)
+            return {}
+        attribute = document.field(item, "attributes", name, dict)
         accessors = [*attribute.values(), *([item["indices"]] if "indices" in item else [])]
         if all("bufferView" in document.item("accessors", value, name) for value in accessors):
-            return None
+            return {}
         owner = f"{DRACO} of {name}"
-        extension = document.object(extensions, DRACO, name)
-        numbers = document.object(extension, "attributes", owner)
+        extension = document.field(extensions, DRACO, name, dict)
+        numbers = document.field(extension, "attributes", owner, dict)
         if "POSITION" not in numbers or "indices" not in item or "POSITION" not in attribute:
             raise document.error(f"must have POSITION and indices in {owner}", f"{sorted(numbers)}")
         corners = document.form(item["indices"], f"indices of {name}", 1, whole=True)
@@ -253,7 +191,7 @@ class DracoReader:
         mesh = self._decoded(extension, owner, corners.rows, vertices.rows)
         face = np.asarray(mesh.faces)
         if face.size != corners.rows:
-            raise document.error(f"must have {corners.rows} corners of triangles in {owner}", str(face.size))
+            raise document.error(f"must have {corners.rows} corners of triangles in {owner}", face.size)
         by_number = {one["unique_id"]: one["data"] for one in mesh.attributes}
         result = {"indices": Elements(face.reshape(-1, 1), np.zeros(0, np.int64), face[:0], 0)}
         for key, number in numbers.items():
@@ -277,13 +215,8 @@ class DracoReader:
         content = bytes(document.view(index, owner)[0])
         size = _CORNER * (corners + vertices * len(extension["attributes"]))
         document.decoding(size, len(content), owner, most=_MOST_DECODED * _CORNER)
-        try:
+        with needs_package("DracoPy", document.path, owner):
             import DracoPy
-        except ImportError as error:
-            raise ImportError(
-                f"{document.path} has compressed geometry ({owner}), which needs the package DracoPy: "
-                "pip install 'jaxprt[web]'"
-            ) from error
         must = f"must have an undamaged mesh of Draco in {owner}"
         try:
             faces, points = mesh_counts(content)
@@ -352,25 +285,15 @@ def _after_metadata(content: bytes, place: int, depth: int) -> int:
 
 
 class Primitive(NamedTuple):
-    """Triangles of a mesh with one material, not yet read.
+    """Triangles of a mesh with one material, not yet read."""
 
-    Attributes:
-        name: Name for messages.
-        material: Index of the material; None for the default one.
-        mode: How corners form triangles.
-        corner: Vertices of the corners; None if they are the vertices in order.
-        attribute: Attributes of the vertices by their names in the file.
-        joints: Number of sets of joints; 0 where no skin is used.
-        targets: Morph targets, as they stand in the file.
-    """
-
-    name: str
-    material: int | None
-    mode: int
-    corner: Elements | None
-    attribute: dict[str, Elements]
-    joints: int
-    targets: list
+    name: str  # for messages
+    material: int | None  # its index; None for the default one
+    mode: int  # how corners form triangles
+    corner: Elements | None  # vertices of the corners; None if they are the vertices in order
+    attribute: dict[str, Elements]  # attributes of the vertices by their names in the file
+    joints: int  # number of sets of joints; 0 where no skin is used
+    targets: list  # morph targets, as they stand in the file
 
     @property
     def flat(self) -> bool:
@@ -388,6 +311,10 @@ class Primitive(NamedTuple):
         """Upper bound of the number of used vertices."""
         corners = 3 * self.face_count
         return corners if self.flat else min(corners, len(self.attribute["POSITION"].value))
+
+
+Drawn = Sequence[tuple[Node, int]]  # nodes that draw a mesh, and the index of the mesh
+Primitives = dict[int, list[Primitive]]  # those of each mesh
 
 
 class Contents(NamedTuple):
@@ -420,24 +347,27 @@ def read(document: Document, *, groups: bool = False, scene: Sequence[Node] | No
         scene: The nodes of the default scene; None reads them.
 
     Raises:
-        ValueError: The file is damaged, has no triangles, requires an unknown extension, or has compressed geometry.
+        ValueError: The file is damaged, has no triangles, or requires an unknown extension.
         MemoryError: The triangles do not fit into memory.
     """
     check_required(document, geometry=True)
     scene = nodes(document) if scene is None else scene
-    drawn = [node for node in scene if "mesh" in node.item]
     ignored: set[str] = set()
-    mesh_of = [document.index("meshes", node.item["mesh"], f"node {node.number}") for node in drawn]
-    skinned = {mesh for node, mesh in zip(drawn, mesh_of, strict=True) if "skin" in node.item}
-    draco = DracoReader(document)
-    primitives = {mesh: _primitives(document, mesh, mesh in skinned, draco, ignored) for mesh in dict.fromkeys(mesh_of)}
+    drawn = [
+        (node, document.index("meshes", node.item["mesh"], f"node {node.number}"))
+        for node in scene
+        if "mesh" in node.item
+    ]
+    skinned = {mesh for node, mesh in drawn if "skin" in node.item}
+    draco = _DracoReader(document)
+    meshes = dict.fromkeys(mesh for _, mesh in drawn)
+    primitives = {mesh: _primitives(document, mesh, mesh in skinned, draco, ignored) for mesh in meshes}
     # Meshes without triangles have no instances: these would take memory that `_check_memory` does not count.
-    drawn = [node for node, mesh in zip(drawn, mesh_of, strict=True) if primitives[mesh]]
-    mesh_of = [mesh for mesh in mesh_of if primitives[mesh]]
-    _check_memory(document, drawn, mesh_of, primitives)
+    drawn = [(node, mesh) for node, mesh in drawn if primitives[mesh]]
+    _check_memory(document, drawn, primitives)
     parts, labels = [], []
     vanished = 0
-    for node, primitive, geometry in _placements(document, scene, drawn, mesh_of, primitives):
+    for node, primitive, geometry in _placements(document, scene, drawn, primitives):
         vanished += primitive.face_count - len(geometry.face)
         if len(geometry.face):
             parts.append(geometry)
@@ -464,25 +394,23 @@ def read(document: Document, *, groups: bool = False, scene: Sequence[Node] | No
     return Contents(geometry, () if groups else tuple(order), frozenset(lacking), frozenset(ignored))
 
 
-def _primitives(document: Document, mesh: int, skinned: bool, draco: DracoReader, ignored: set[str]) -> list[Primitive]:
+def _primitives(
+    document: Document, mesh: int, skinned: bool, draco: _DracoReader, ignored: set[str]
+) -> list[Primitive]:
     """The primitives of a mesh that consist of triangles. Adds the names of what is not read to `ignored`."""
-    owner = f"mesh {mesh}"
     primitives = []
-    for number, item in enumerate(document.array(document.items("meshes")[mesh], "primitives", owner)):
-        name = f"primitive {number} of {owner}"
-        if not isinstance(item, dict):
-            raise document.error(f"must have an object for {name}", repr(item)[:80])
-        mode = document.integer(item, "mode", name, _TRIANGLES)
+    for name, item in document.objects(document.items("meshes")[mesh], "primitives", f"mesh {mesh}", "primitive"):
+        mode = document.field(item, "mode", name, int, _TRIANGLES)
         if mode > _FAN:
-            raise document.error(f"must have a mode from 0 to {_FAN} in {name}", str(mode))
+            raise document.error(f"must have a mode from 0 to {_FAN} in {name}", mode)
         if mode < _TRIANGLES:
             ignored.add("points and lines")
             continue
         material = item.get("material")
         if material is not None:
             material = document.index("materials", material, name)
-        attribute = document.object(item, "attributes", name)
-        decoded = draco.primitive(item, name) or {}
+        attribute = document.field(item, "attributes", name, dict)
+        decoded = draco.primitive(item, name)
         elements = _elements(document, attribute, skinned, decoded, name, ignored)
         index = decoded.get("indices")
         mode = mode if index is None else _TRIANGLES
@@ -491,9 +419,9 @@ def _primitives(document: Document, mesh: int, skinned: bool, draco: DracoReader
         corners = len((index or elements["POSITION"]).value)
         if corners < 3 or (mode == _TRIANGLES and corners % 3):
             must = "a multiple of three" if mode == _TRIANGLES else "three or more"
-            raise document.error(f"must have {must} corners of triangles in {name}", str(corners))
+            raise document.error(f"must have {must} corners of triangles in {name}", corners)
         sets = sum(key.startswith("JOINTS_") for key in elements)
-        targets = document.array(item, "targets", name)
+        targets = document.field(item, "targets", name, list)
         changed = {key for target in targets if isinstance(target, dict) for key in target}
         unchanged = changed - (elements.keys() & _MORPHS.keys()) - {"NORMAL", "TANGENT"}
         ignored |= {f"{key} of morph targets" for key in unchanged if not key.startswith("_")}
@@ -530,7 +458,7 @@ def _elements(
             elements[key] = decoded.get(key) or document.accessor(attribute[key], owner, *width, whole=whole)
             got, count = len(elements[key].value), len(elements["POSITION"].value)
             if got != count:
-                raise document.error(f"must have {count} elements in {key} of {name}, as in POSITION", str(got))
+                raise document.error(f"must have {count} elements in {key} of {name}, as in POSITION", got)
             fraction = _normalized(document, elements[key], key)
             if fraction is not elements[key]:
                 ignored.add(f"{key} of integers without normalized (they are read as normalized)")
@@ -549,9 +477,7 @@ def _normalized(document: Document, elements: Elements, key: str) -> Elements:
     return elements._replace(most=int(np.iinfo(elements.value.dtype).max))
 
 
-def _check_memory(
-    document: Document, drawn: Sequence[Node], mesh_of: Sequence[int], primitives: dict[int, list[Primitive]]
-) -> None:
+def _check_memory(document: Document, drawn: Drawn, primitives: Primitives) -> None:
     """Refuses geometry that does not fit into memory, before it is read."""
     size: dict[int, np.ndarray] = {}
     for mesh, listed in primitives.items():
@@ -561,8 +487,8 @@ def _check_memory(
         joints = sum(primitive.most_vertices for primitive in listed if primitive.joints)
         need = vertices * _VERTEX + joints * _JOINTS + faces * _FACE + len(listed) * _PART
         size[mesh] = np.array([vertices, faces, need], object)  # Python's integers, which do not overflow
-    times = [instance_count(document, node) for node in drawn]
-    total = sum((count * size[mesh] for count, mesh in zip(times, mesh_of, strict=True)), np.zeros(3, object))
+    times = [instance_count(document, node) for node, _ in drawn]
+    total = sum((count * size[mesh] for count, (_, mesh) in zip(times, drawn, strict=True)), np.zeros(3, object))
     vertices, faces, need = total.tolist()
     require.memory(
         f"up to {vertices:,} vertices and {faces:,} triangles in {sum(times):,} meshes of {document.path}",
@@ -572,19 +498,13 @@ def _check_memory(
 
 
 def _placements(
-    document: Document,
-    scene: Sequence[Node],
-    drawn: Sequence[Node],
-    mesh_of: Sequence[int],
-    primitives: dict[int, list[Primitive]],
+    document: Document, scene: Sequence[Node], drawn: Drawn, primitives: Primitives
 ) -> Iterator[tuple[Node, Primitive, Geometry]]:
     """The primitives of all nodes in world coordinates, in the order of the nodes. Equal meshes are placed at once."""
-    matrices = [instance_matrices(document, node) for node in drawn]
+    matrices = [instance_matrices(document, node) for node, _ in drawn]
     most = {mesh: max(len(primitive.targets) for primitive in listed) for mesh, listed in primitives.items() if listed}
     # Meshes are equal if their morph targets have the same weights.
-    shapes = [
-        (mesh, morph_weights(document, node, mesh, most[mesh])) for node, mesh in zip(drawn, mesh_of, strict=True)
-    ]
+    shapes = [(mesh, _morph_weights(document, node, mesh, most[mesh])) for node, mesh in drawn]
     together: dict[tuple, list[np.ndarray]] = {}
     for shape, matrix in zip(shapes, matrices, strict=True):
         together.setdefault(shape, []).append(matrix)
@@ -593,41 +513,35 @@ def _placements(
         pairs = [_geometry(document, primitive, shape[1]) for primitive in primitives[shape[0]]]
         bound[shape] = pairs
         placed[shape] = [iter(instances(geometry, np.concatenate(transforms))) for geometry, _ in pairs]
-    skins = _skins(document, scene, drawn, mesh_of, primitives)
-    for node, shape, matrix in zip(drawn, shapes, matrices, strict=True):
+    skins = _skins(document, scene, drawn, primitives)
+    for (node, _), shape, matrix in zip(drawn, shapes, matrices, strict=True):
         skin, listed = skins.get(node.number), primitives[shape[0]]
         flattens = flat(matrix) if skin is None else np.repeat(flat(skin).any(), len(matrix))
         for flattened in flattens:
             for primitive, (geometry, binding), rest in zip(listed, bound[shape], placed[shape], strict=True):
                 here = next(rest)
                 if skin is not None and binding is not None:
-                    here = apply_skin(document, geometry, binding, skin, primitive.name)
+                    here = _apply_skin(document, geometry, binding, skin, primitive.name)
                     here = here._replace(normal=_face_normals(here.position[here.face])) if primitive.flat else here
                 yield node, primitive, with_area(here) if flattened else here
 
 
-def _skins(
-    document: Document,
-    scene: Sequence[Node],
-    drawn: Sequence[Node],
-    mesh_of: Sequence[int],
-    primitives: dict[int, list[Primitive]],
-) -> dict[int, np.ndarray]:
+def _skins(document: Document, scene: Sequence[Node], drawn: Drawn, primitives: Primitives) -> dict[int, np.ndarray]:
     """Transforms of the joints of all nodes that draw a mesh with a skin, by the index of the node."""
     skin = {
         node.number: document.index("skins", node.item["skin"], f"node {node.number}")
-        for node, mesh in zip(drawn, mesh_of, strict=True)
+        for node, mesh in drawn
         if "skin" in node.item and any(primitive.joints for primitive in primitives[mesh])
     }
     if not skin:
         return {}
-    named = [joint for number in set(skin.values()) for joint in skin_joints(document, number)]
-    world = joint_transforms(document, scene, named)
-    matrices = {number: joint_matrices(document, number, world) for number in set(skin.values())}
+    joints = [joint for number in set(skin.values()) for joint in _skin_joints(document, number)]
+    world = joint_transforms(document, scene, joints)
+    matrices = {number: _joint_matrices(document, number, world) for number in set(skin.values())}
     return {node: matrices[number] for node, number in skin.items()}
 
 
-def _geometry(document: Document, primitive: Primitive, weight: tuple[float, ...]) -> tuple[Geometry, Binding | None]:
+def _geometry(document: Document, primitive: Primitive, weight: Sequence[float]) -> tuple[Geometry, _Binding | None]:
     """The triangles of a primitive (section 3.7.2) at weights of its morph targets, and the joints of its vertices."""
     face = _faces(document, primitive)
     if primitive.flat:
@@ -635,27 +549,21 @@ def _geometry(document: Document, primitive: Primitive, weight: tuple[float, ...
     else:
         used, face = _compact_vertices(face, len(primitive.attribute["POSITION"].value))
 
-    count = len(primitive.attribute["POSITION"].value)
-
-    def values(key: str) -> np.ndarray | None:
-        if key not in primitive.attribute:
-            return None
-        value, targets = primitive.attribute[key].numbers(used), primitive.targets
-        change = morph_change(document, targets, weight, key=key, used=used, count=count, name=primitive.name)
+    value: dict[str, np.ndarray] = {}
+    for key in [key for key in _ATTRIBUTES if key in primitive.attribute]:
+        if key == "TANGENT" and primitive.flat:
+            continue  # section 3.7.2.1: ignored without normals
+        value[key] = primitive.attribute[key].numbers(used)
+        change = _morph_change(document, primitive, weight, key, used)
         if isinstance(change, np.ndarray):
-            width = min(value.shape[1], change.shape[1])
-            value[:, :width] += change[:, :width]
-        return value
-
-    position = values("POSITION")
-    assert position is not None
-    normal = _face_normals(position) if primitive.flat else values("NORMAL")
-    tangent = None if primitive.flat else values("TANGENT")  # section 3.7.2.1: ignored without normals
-    color = values("COLOR_0")
+            width = min(value[key].shape[1], change.shape[1])
+            value[key][:, :width] += change[:, :width]
+    position, tangent, color = value["POSITION"], value.get("TANGENT"), value.get("COLOR_0")
+    normal = _face_normals(position) if primitive.flat else value["NORMAL"]
     # In glTF v points down. Coordinates that are not finite count as missing.
     texture, second = (
         None if place is None else np.where(np.isfinite(place), [[0, 1]] + place * [[1, -1]], 0)
-        for place in (values("TEXCOORD_0"), values("TEXCOORD_1"))
+        for place in (value.get("TEXCOORD_0"), value.get("TEXCOORD_1"))
     )
     geometry = Geometry(
         position,
@@ -668,8 +576,7 @@ def _geometry(document: Document, primitive: Primitive, weight: tuple[float, ...
         None if color is None else np.clip(np.nan_to_num(color[:, :3]), 0, 1),
         alpha=None if color is None or color.shape[1] < 4 else np.clip(np.nan_to_num(color[:, 3], nan=1.0), 0, 1),
     )
-    bound = skin_binding(document, primitive.attribute, primitive.joints, used, primitive.name)
-    return geometry, bound
+    return geometry, _skin_binding(document, primitive.attribute, primitive.joints, used, primitive.name)
 
 
 def _face_normals(position: np.ndarray) -> np.ndarray:

@@ -21,17 +21,11 @@ _STRAIGHT = 1e-9  # sine of the angle between two rotations below which their me
 
 
 class Node(NamedTuple):
-    """A node with its transform to world coordinates.
+    """A node with its transform to world coordinates."""
 
-    Attributes:
-        number: Index of the node.
-        item: The JSON object of the node.
-        matrix: Transform from the node to world coordinates [4 4].
-    """
-
-    number: int
-    item: dict[str, Any]
-    matrix: np.ndarray
+    number: int  # index of the node
+    item: dict[str, Any]  # its JSON object
+    matrix: np.ndarray  # [4 4]
 
 
 def nodes(document: Document) -> list[Node]:
@@ -39,7 +33,7 @@ def nodes(document: Document) -> list[Node]:
     if document.items("scenes"):
         number = document.index("scenes", document.header.get("scene", 0), "the default scene")
         owner = f"scene {number}"
-        return _tree_nodes(document, document.array(document.items("scenes")[number], "nodes", owner), owner)
+        return _tree_nodes(document, document.field(document.items("scenes")[number], "nodes", owner, list), owner)
     return _tree_nodes(document, _roots(document), "the file")
 
 
@@ -47,18 +41,12 @@ def joint_transforms(document: Document, scene: Sequence[Node], joints: Iterable
     """World transforms of the nodes of the scene, and of joints outside of it. Joints in a circle of nodes have none.
 
     The reader skips all other nodes outside of the scene, so damage in them does not matter.
-
-    Args:
-        document: The file.
-        scene: The nodes of the default scene.
-        joints: Indices of the joints.
     """
     matrices = {node.number: node.matrix for node in scene}
     outside = [joint for joint in dict.fromkeys(joints) if joint not in matrices]
     parents = _parents(document) if outside else {}
-    place: dict[int, int] = {}  # in the order of `above` and `level`
+    place: dict[int, int] = {}  # in the order of `above`
     above: list[int] = []
-    level: list[int] = []
     for joint in outside:
         way: dict[int, None] = {}  # from the joint up
         node: int | None = joint
@@ -73,9 +61,8 @@ def joint_transforms(document: Document, scene: Sequence[Node], joints: Iterable
             continue  # a circle
         for child in reversed(way):
             above.append(-1 if node is None else place[node])
-            level.append(0 if node is None else level[place[node]] + 1)
             place[child], node = len(place), child
-    return matrices | {node.number: node.matrix for node in _in_world(document, list(place), above, level)}
+    return matrices | {node.number: node.matrix for node in _in_world(document, list(place), above)}
 
 
 def _parents(document: Document) -> dict[int, list[int]]:
@@ -91,58 +78,48 @@ def _parents(document: Document) -> dict[int, list[int]]:
 
 def instance_count(document: Document, node: Node) -> int:
     """How often a node repeats its mesh: once, or as often as EXT_mesh_gpu_instancing says."""
-    attributes = _instance_attributes(document, node)
-    if attributes is None:
-        return 1
-    owner = f"{INSTANCING} of node {node.number}"
-    if not attributes:
-        raise document.error(f"must have TRANSLATION, ROTATION or SCALE in {owner}", "none")
-    counts = {key: len(elements.value) for key, elements in attributes.items()}
-    if len(set(counts.values())) > 1:
-        raise document.error(f"must have attributes of one count in {owner}", excerpt(counts))
-    return next(iter(counts.values()))
+    return _instance_attributes(document, node)[0]
 
 
 def instances(document: Document, node: Node) -> np.ndarray:
     """World transforms of the instances of a node's mesh [n 4 4]."""
-    count, attributes, owner = (
-        instance_count(document, node),
-        _instance_attributes(document, node),
-        f"node {node.number}",
-    )
-    if attributes is None:
+    count, attributes = _instance_attributes(document, node)
+    if not attributes:
         return node.matrix[None]
     value = {key: attributes[key].numbers() for key in _TRANSFORM if key in attributes}
     for key, array in value.items():
-        right = np.isfinite(array).all(1) & ((key != "ROTATION") | array.any(1))
-        if not right.all():
-            wrong = np.flatnonzero(~right)
+        wrong = np.flatnonzero(~(np.isfinite(array).all(1) & ((key != "ROTATION") | array.any(1))))
+        if wrong.size:
             got = f"{len(wrong)} of {count} that are not, the first is {array[wrong[0]].tolist()} at {wrong[0]}"
             must = "nonzero quaternions" if key == "ROTATION" else "finite numbers"
-            raise document.error(f"must have {must} in {key} of {INSTANCING} of {owner}", got)
+            raise document.error(f"must have {must} in {key} of {INSTANCING} of node {node.number}", got)
     local = np.tile(np.eye(4), (count, 1, 1))
     if "ROTATION" in value:
         local[:, :3, :3] = _rotations(value["ROTATION"])
-    if "SCALE" in value:
-        local[:, :3, :3] *= value["SCALE"][:, None]
-    if "TRANSLATION" in value:
-        local[:, :3, 3] = value["TRANSLATION"]
+    local[:, :3, :3] *= value.get("SCALE", np.ones((1, 3)))[:, None]
+    local[:, :3, 3] = value.get("TRANSLATION", 0)
     return node.matrix @ local
 
 
-def _instance_attributes(document: Document, node: Node) -> dict[str, Elements] | None:
-    """The attributes of a node's instances; None if it has one without attributes."""
+def _instance_attributes(document: Document, node: Node) -> tuple[int, dict[str, Elements]]:
+    """The number of a node's instances, and their attributes; none for a node without instances."""
     owner = f"node {node.number}"
-    extensions = document.object(node.item, "extensions", owner)
+    extensions = document.field(node.item, "extensions", owner, dict)
     if INSTANCING not in extensions:
-        return None
+        return 1, {}
     owner = f"{INSTANCING} of {owner}"
-    attribute = document.object(document.object(extensions, INSTANCING, owner), "attributes", owner)
+    attribute = document.field(document.field(extensions, INSTANCING, owner, dict), "attributes", owner, dict)
     # Attributes of other names are for applications, but they count instances too.
-    return {
+    elements = {
         key: document.accessor(value, f"{inputs.shortened(key)} of {owner}", *_TRANSFORM.get(key, (1, 2, 3, 4)))
         for key, value in attribute.items()
     }
+    if not elements:
+        raise document.error(f"must have TRANSLATION, ROTATION or SCALE in {owner}", "none")
+    counts = {key: len(one.value) for key, one in elements.items()}
+    if len(set(counts.values())) > 1:
+        raise document.error(f"must have attributes of one count in {owner}", excerpt(counts))
+    return next(iter(counts.values())), elements
 
 
 def _roots(document: Document) -> list[int]:
@@ -152,7 +129,7 @@ def _roots(document: Document) -> list[int]:
         document.index("nodes", child, f"node {number}")
         for number, item in enumerate(items)
         if "children" in item
-        for child in document.array(item, "children", f"node {number}")
+        for child in document.field(item, "children", f"node {number}", list)
     }
     return [number for number in range(len(items)) if number not in children]
 
@@ -161,8 +138,7 @@ def _tree_nodes(document: Document, roots: list, owner: str) -> list[Node]:
     """The nodes of trees, parents before their children, from the roots that `owner` has in the file."""
     items = document.items("nodes")
     order: list[int] = []
-    parent: list[int] = []  # place of the parent in `order`; -1 for roots
-    level: list[int] = []
+    parent: list[int] = []
     seen = set()
     waiting = [(root, -1) for root in reversed(roots)]
     while waiting:
@@ -173,24 +149,26 @@ def _tree_nodes(document: Document, roots: list, owner: str) -> list[Node]:
             raise document.error("must have nodes that form trees", f"node {index} twice, the second time in {name}")
         seen.add(index)
         if "children" in items[index]:
-            children = document.array(items[index], "children", f"node {index}")
+            children = document.field(items[index], "children", f"node {index}", list)
             waiting += [(child, len(order)) for child in reversed(children)]
         order.append(index)
         parent.append(above)
-        level.append(level[above] + 1 if above >= 0 else 0)
-    return _in_world(document, order, parent, level)
+    return _in_world(document, order, parent)
 
 
-def _in_world(document: Document, order: list[int], parent: list[int], level: list[int]) -> list[Node]:
-    """Nodes with their transforms to world coordinates; `parent` is a place in `order`, -1 for roots."""
+def _in_world(document: Document, order: list[int], parent: list[int]) -> list[Node]:
+    """Nodes with their transforms to world coordinates. Each `parent` is an earlier index in `order`, -1 for roots."""
     if not order:
         return []
+    level: list[int] = []
+    for above in parent:
+        level.append(level[above] + 1 if above >= 0 else 0)
     items = document.items("nodes")
     matrix = _transforms(document, order)
-    above, by_level = np.array(parent), np.argsort(level, kind="stable")
+    parents, by_level = np.array(parent), np.argsort(level, kind="stable")
     with np.errstate(over="ignore", invalid="ignore"):  # reported below
         for rows in np.split(by_level, np.cumsum(np.bincount(level)))[1:-1]:
-            matrix[rows] = matrix[above[rows]] @ matrix[rows]
+            matrix[rows] = matrix[parents[rows]] @ matrix[rows]
     wrong = np.flatnonzero(~(np.abs(matrix) <= LARGEST_FLOAT).all((1, 2)))
     if wrong.size:
         got = f"numbers that are not finite at node {order[wrong[0]]}"
@@ -239,20 +217,13 @@ def _rotations(quaternion: np.ndarray) -> np.ndarray:
     return np.moveaxis(np.array(rows), -1, 0)
 
 
-class Sampler(NamedTuple):
-    """The keys of one channel.
+class _Sampler(NamedTuple):
+    """The keys of one channel."""
 
-    Attributes:
-        time: Times of the keys in seconds, in ascending order [k].
-        value: The elements of the accessor of values: n for each key, or 3 n in a cubic spline.
-        kind: How values between keys are interpolated.
-        name: Name for messages.
-    """
-
-    time: np.ndarray
-    value: Elements
-    kind: str
-    name: str
+    time: np.ndarray  # of the keys in seconds, in ascending order [k]
+    value: Elements  # n for each key, or 3 n in a cubic spline
+    kind: str  # how values between keys are interpolated
+    name: str  # for messages
 
 
 def pose(document: Document, time: float, animation: str | int | None) -> set[str]:
@@ -270,29 +241,23 @@ def pose(document: Document, time: float, animation: str | int | None) -> set[st
         Names of features of the animation that are not read.
     """
     index = _animation_index(document, animation)
-    owner = f"animation {index}"
-    item = document.items("animations")[index]
-    samplers, ignored = document.array(item, "samplers", owner), set()
+    owner, item = f"animation {index}", document.items("animations")[index]
+    samplers, ignored = document.field(item, "samplers", owner, list), set()
     moved: dict[int, dict[str, Any]] = {}
-    for number, channel in enumerate(document.array(item, "channels", owner)):
-        name = f"channel {number} of {owner}"
-        if not isinstance(channel, dict):
-            raise document.error(f"must have an object for {name}", excerpt(channel))
-        target = document.object(channel, "target", name)
-        path = document.string(target, "path", name)
+    for name, channel in document.objects(item, "channels", owner, "channel"):
+        target = document.field(channel, "target", name, dict)
+        path = document.field(target, "path", name, str)
         if path not in _CHANNEL_WIDTH:
             ignored.add(_POINTER if path == "pointer" else f"animations of {excerpt(path)}")
-            continue
-        if "node" not in target:
-            continue  # section 3.11: the channel is ignored
-        node = document.index("nodes", target["node"], name)
-        if path != "weights" and "matrix" in document.items("nodes")[node]:
-            raise document.error(f"must have no matrix in node {node}, which {name} moves", "one")
-        sampler = _sampler(document, samplers, channel.get("sampler"), path, name)
-        value = _channel_value(document, sampler, path, time)
-        if path == "rotation" and not value.any():
-            raise document.error(f"must have a nonzero quaternion in {name} at {time:g} s", "zero")
-        moved.setdefault(node, {})[path] = value.ravel().tolist()
+        elif "node" in target:  # section 3.11: other channels are ignored
+            node = document.index("nodes", target["node"], name)
+            if path != "weights" and "matrix" in document.items("nodes")[node]:
+                raise document.error(f"must have no matrix in node {node}, which {name} moves", "one")
+            sampler = _sampler(document, samplers, channel.get("sampler"), path, name)
+            value = _channel_value(document, sampler, path, time)
+            if path == "rotation" and not value.any():
+                raise document.error(f"must have a nonzero quaternion in {name} at {time:g} s", "zero")
+            moved.setdefault(node, {})[path] = value.ravel().tolist()
     document.change("nodes", moved)
     return ignored
 
@@ -315,12 +280,9 @@ def _animation_index(document: Document, animation: str | int | None) -> int:
     return names.index(animation)
 
 
-def _sampler(document: Document, samplers: list, value: Any, path: str, name: str) -> Sampler:
+def _sampler(document: Document, samplers: list, value: Any, path: str, name: str) -> _Sampler:
     """The keys of a channel, with the checks of their counts and times."""
-    right = type(value) is int and 0 <= value < len(samplers) and isinstance(samplers[value], dict)
-    if not right:
-        raise document.error(f"must refer to one of its {len(samplers)} samplers in {name}", excerpt(value))
-    item = samplers[value]
+    item = samplers[document.index("samplers", value, name, samplers)]
     kind = item.get("interpolation", "LINEAR")
     if kind not in _INTERPOLATION:
         raise document.error(f"must have one of {', '.join(_INTERPOLATION)} as interpolation of {name}", excerpt(kind))
@@ -336,11 +298,11 @@ def _sampler(document: Document, samplers: list, value: Any, path: str, name: st
     count = len(values.value)
     if count % size if path == "weights" else count != size:
         must = f"{'a multiple of ' if path == 'weights' else ''}{size} values for the {len(keys)} keys"
-        raise document.error(f"must have {must} of {name}, whose interpolation is {kind}", str(count))
-    return Sampler(keys, values, kind, name)
+        raise document.error(f"must have {must} of {name}, whose interpolation is {kind}", count)
+    return _Sampler(keys, values, kind, name)
 
 
-def _channel_value(document: Document, sampler: Sampler, path: str, time: float) -> np.ndarray:
+def _channel_value(document: Document, sampler: _Sampler, path: str, time: float) -> np.ndarray:
     """The value of a channel at a time (appendix C): rows of the elements of one key."""
     keys, cubic = sampler.time, sampler.kind == "CUBICSPLINE"
     height = len(sampler.value.value) // len(keys)
@@ -355,20 +317,15 @@ def _channel_value(document: Document, sampler: Sampler, path: str, time: float)
         return np.split(rows(key), 3)[1] if cubic else rows(key)
 
     last = int(np.searchsorted(keys, time, side="right")) - 1
-    if last < 0 or last == len(keys) - 1:
-        value = middle(max(last, 0))
-    else:
-        step = keys[last + 1] - keys[last]
-        along = (time - keys[last]) / step
-        if sampler.kind == "STEP":
-            value = middle(last)
-        elif cubic:
-            value = _hermite(np.split(rows(last), 3), np.split(rows(last + 1), 3), step, along)
-        elif path == "rotation":
-            value = slerp(middle(last)[0], middle(last + 1)[0], along)[None]
-        else:
-            value = (1 - along) * middle(last) + along * middle(last + 1)
-    return value
+    if last < 0 or last == len(keys) - 1 or sampler.kind == "STEP":
+        return middle(max(last, 0))
+    step = keys[last + 1] - keys[last]
+    along = (time - keys[last]) / step
+    if cubic:
+        return _hermite(np.split(rows(last), 3), np.split(rows(last + 1), 3), step, along)
+    if path == "rotation":
+        return slerp(middle(last)[0], middle(last + 1)[0], along)[None]
+    return (1 - along) * middle(last) + along * middle(last + 1)
 
 
 def _hermite(before: Sequence[np.ndarray], after: Sequence[np.ndarray], step: float, along: float) -> np.ndarray:
@@ -381,13 +338,7 @@ def _hermite(before: Sequence[np.ndarray], after: Sequence[np.ndarray], step: fl
 
 
 def slerp(start: np.ndarray, end: np.ndarray, along: float) -> np.ndarray:
-    """Unit quaternion at a fraction of the shorter way between two rotations (appendix C.4).
-
-    Args:
-        start: Quaternion [4] of any length. Zero gives zero.
-        end: Quaternion [4] of any length.
-        along: Fraction of the way, from 0 to 1.
-    """
+    """Unit quaternion at a fraction of the shorter way between two rotations (appendix C.4). Zero gives zero."""
     scale = np.linalg.norm(start) * np.linalg.norm(end)
     if scale == 0:
         return np.zeros(4)

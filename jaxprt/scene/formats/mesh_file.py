@@ -11,6 +11,7 @@ from jaxprt.scene.formats.geometry import Geometry, MeshContent, Polygons
 
 # Texture coordinates, colors, normals, a fourth coordinate, and another dimension.
 _KEYWORD = re.compile(rb"\s*(ST)?(C)?(N)?(4)?(n)?(?i:OFF)(?:[ \t]+(BINARY))?")
+_NO_LISTS = (np.zeros(0), np.zeros(0, np.int64))
 _HEADER = 80
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("vertex", "<f4", (3, 3)), ("attribute", "<u2")])
 _COLORED = 1 << 15  # bit of the attribute that VisCAM sets where it holds a color
@@ -30,15 +31,6 @@ def read_off(path: pathlib.Path) -> MeshContent:
         path: The file.
     """
     content = re.sub(rb"#[^\n]*", b"", text.read(path, "an undamaged OFF file"))
-    try:
-        return _off_content(content, path)
-    except ValueError as error:
-        if str(error).startswith(str(path)):
-            raise
-        raise text.unreadable(path, "OFF", error) from error
-
-
-def _off_content(content: bytes, path: pathlib.Path) -> MeshContent:
     keyword = _KEYWORD.match(content)
     textured, colored, normals, fourth, dimension, binary = keyword.groups() if keyword else [None] * 6
     if keyword and (dimension or binary):
@@ -54,9 +46,7 @@ def _off_content(content: bytes, path: pathlib.Path) -> MeshContent:
     position, of_vertex, ignored = _vertices(
         list(text.tables(rows, vertices, "vertex")), bool(textured), bool(colored), bool(normals), bool(fourth)
     )
-    parts = [(*table.lists(), *table.remaining()) for table in text.tables(rows, faces, "face")]
-    if not parts or max(part[1].max() for part in parts) < 3:
-        raise ValueError(f"{path} must hold vertices and faces, got no faces")
+    parts = [(*table.lists(), *table.remaining()) for table in text.tables(rows, faces, "face")] or [_NO_LISTS * 2]
     corner, count, rest, rest_count = map(np.concatenate, zip(*parts, strict=True))
     shape = Polygons(text.whole_lists(corner, count, "face"), count)
     geometry.check_polygons(shape, vertices, str(path))
@@ -82,8 +72,7 @@ def _vertices(
             position = position / value[:, 3:4]
     ignored: set[str] = set()
     of_vertex: dict[str, np.ndarray | None] = {"normal": value[:, width:] if normals else None}
-    rests = [table.remaining() for table in tables]
-    rest, count = map(np.concatenate, zip(*rests, strict=True)) if rests else (np.zeros(0), np.zeros(0, int))
+    rest, count = map(np.concatenate, zip(*([table.remaining() for table in tables] or [_NO_LISTS]), strict=True))
     if textured and len(count) and (count >= 2).all():
         end = np.cumsum(count)
         of_vertex["texture"] = np.stack([rest[end - 2], rest[end - 1]], -1)
@@ -117,11 +106,7 @@ def read_stl(path: pathlib.Path) -> MeshContent:
     Args:
         path: The file.
     """
-    content = inputs.content(path, "a mesh file")
-    try:
-        position, ignored = _triangles(content)
-    except ValueError as error:
-        raise text.unreadable(path, "STL", error) from error
+    position, ignored = _triangles(inputs.content(path, "a mesh file"))
     if not len(position):
         raise ValueError(f"{path} must hold vertices and faces, got no faces")
     face = np.arange(3 * len(position)).reshape(-1, 3)
@@ -170,7 +155,7 @@ def read(path: pathlib.Path, *, groups: bool) -> Geometry:
     """Reads the triangles of a file in world coordinates, with regions. Only those of glTF files have colors."""
     check(path)
     if path.suffix.lower() in (".glb", ".gltf"):
-        with gltf_file.name_file_in_errors(path):
+        with text.name_file_in_errors(path, "glTF"):
             return gltf_geometry.read(gltf_file.Document(path), groups=groups).geometry
     return content(path, groups=groups).geometry._replace(color=None)
 
@@ -181,9 +166,8 @@ _READERS = {".ply": ply.read, ".stl": read_stl, ".off": read_off}
 def content(path: pathlib.Path, *, groups: bool) -> MeshContent:
     """Reads a PLY, OBJ, STL or OFF file with its colors and the names of its images."""
     suffix = path.suffix.lower()
-    if suffix == ".obj":
-        return obj.read(path, groups=groups)
-    read_content = _READERS[suffix](path)
-    geometry = read_content.geometry
-    region = np.zeros(len(geometry.position), int) if geometry.region is None else geometry.region
-    return read_content._replace(geometry=geometry._replace(region=region))
+    with text.name_file_in_errors(path, suffix[1:].upper()):
+        read_content = obj.read(path, groups=groups) if suffix == ".obj" else _READERS[suffix](path)
+    shape = read_content.geometry
+    region = np.zeros(len(shape.position), int) if shape.region is None else shape.region
+    return read_content._replace(geometry=shape._replace(region=region))

@@ -24,13 +24,12 @@ from jaxprt.scene import environment
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.formats import mesh_file
-from jaxprt.scene.formats.file_parts import split_parts, warn_of_ignored
+from jaxprt.scene.formats.file_parts import FLIP, split_parts, warn_of_ignored
 from jaxprt.scene.formats.geometry import Geometry, place
 from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.mesh import grid_face
 from jaxprt.scene.scene import Part, Scene
 
-FLIP = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])  # converts between v up and v down
 _LUMINANCE = np.array([0.212671, 0.715160, 0.072169])  # Rec. 709 weights of Mitsuba's textures
 _WRAPPERS = {"twosided", "mask", "bumpmap", "normalmap"}
 _MAKERS = {"diffuse", "principled", "conductor", "roughconductor", "plastic", "roughplastic"}

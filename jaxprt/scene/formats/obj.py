@@ -14,16 +14,13 @@ import numpy as np
 
 from jaxprt.files import inputs
 from jaxprt.scene.formats import geometry, text
-from jaxprt.scene.formats.file_parts import TextureImages, warn_of_ignored
+from jaxprt.scene.formats.file_parts import TextureImages
 from jaxprt.scene.formats.geometry import Geometry, MeshContent, split_corners
 from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.mesh import CLEAR
 
-KIND = "an undamaged OBJ file"
 _WHITE = re.compile(r"[ \t]+")
 _COMMENT = re.compile(r"^#.*|\s#(\s.*)?$")  # names may contain a #, such as Blender's "Material_#25"
-_NAMING = re.compile(rb"^[^\S\n]*(usemtl|mtllib)(?!\S)([^\n]*)", re.MULTILINE)
-_FACE = re.compile(rb"^[^\S\n]*f\s", re.MULTILINE)
 _COMMENT_PATH = re.compile(rb"^[^\S\n]*#[^\n]*\\$", re.MULTILINE)
 _WHOLE = re.compile(rb"[+-]?\d{1,40}")  # of words with more digits, Python would refuse some
 _CONTINUED = b" \v"  # replaces the line end after a backslash; \v is white space, and counts such lines for messages
@@ -97,42 +94,22 @@ class _Source(NamedTuple):
         return f"{text.name(lines[line].strip().replace(_CONTINUED, b' '))[:80]!r} in line {number}"
 
 
-def statement(line: str) -> str:
+def _statement(line: str) -> str:
     """A line of an OBJ or MTL file without its comment. A comment starts with a # that stands alone or first."""
     return _COMMENT.sub("", line.strip()).strip()
 
 
-def content(path: pathlib.Path) -> bytes:
+def _content(path: pathlib.Path) -> bytes:
     """The text of an OBJ file with continued lines joined."""
-    source = text.read(path, KIND)
+    source = text.read(path, "an undamaged OBJ file")
     if b"\\\n" not in source:
         return source
     # Comments do not continue. They may end in a path of Windows.
     return _COMMENT_PATH.sub(lambda line: line[0] + b" ", source).replace(b"\\\n", _CONTINUED)
 
 
-def used_materials(source: bytes) -> tuple[list[str | None], list[str]]:
-    """Names of the materials of an OBJ file in the order of their first faces, and names of its MTL files.
-
-    None stands for faces without a material.
-    """
-    order: dict[str | None, None] = {}
-    files = []
-    material, start = None, 0
-    for match in _NAMING.finditer(source):
-        if match[1] == b"mtllib":
-            files.append(_name(match[2]))
-            continue
-        if material not in order and _FACE.search(source, start, match.start()):
-            order[material] = None
-        material, start = _name(match[2]) or None, match.end()
-    if material not in order and _FACE.search(source, start):
-        order[material] = None
-    return list(order), files
-
-
 def read(path: pathlib.Path, *, groups: bool) -> MeshContent:
-    """Reads the geometry of an OBJ file. Colors are NaN where vertices have none.
+    """Reads the geometry of an OBJ file, and the names of its materials. Colors are NaN where vertices have none.
 
     Args:
         path: The file.
@@ -141,21 +118,26 @@ def read(path: pathlib.Path, *, groups: bool) -> MeshContent:
     Raises:
         ValueError: A statement is damaged. The message names the file and the line.
     """
-    source = _Source(path, content(path))
-    rows, faces, ignored = _statements(source, groups=groups)
+    source = _Source(path, _content(path))
+    rows, faces, regions, libraries, ignored = _statements(source, groups=groups)
     if not len(faces.size):
         extra = f" ({', '.join(sorted(ignored))} are not read)" if ignored else ""
         raise ValueError(f"{path} must hold vertices and faces, got no faces{extra}")
     geometry = _geometry(rows, _absolute_indices(faces, rows, source), source)
-    return MeshContent(geometry, [], ignored | _extra_numbers(rows[0].value))
+    ignored |= _extra_numbers(rows[0].value)
+    names = [region[0] or None for region in regions]
+    return MeshContent(geometry, names, ignored, libraries, text.name(source.content.partition(b"\n")[0]))
 
 
-def _statements(source: _Source, *, groups: bool) -> tuple[list[_Rows], _Faces, set[str]]:
-    """Reads the numbers of v, vt and vn, the faces, and the names of statements that are not read."""
+def _statements(
+    source: _Source, *, groups: bool
+) -> tuple[list[_Rows], _Faces, list[tuple[str, ...]], list[str], set[str]]:
+    """The numbers of v, vt and vn, the faces, the names of regions and of MTL files, and what is not read."""
     rows: dict[bytes, list[_Rows]] = {kind: [] for kind in _LEAST}
     faces: list[_Faces] = []
     regions: dict[tuple[str, ...], int] = {}
     unread: dict[bytes, None] = {}
+    libraries: list[str] = []
     names = {b"o": "", b"g": ""} if groups else {b"usemtl": ""}
     region, start = -1, 0
     group, smoothed = b"", set[bytes]()
@@ -178,6 +160,8 @@ def _statements(source: _Source, *, groups: bool) -> tuple[list[_Rows], _Faces, 
                     smoothed.add(group)
             elif kind in names:
                 names[kind], region = _name(tail), -1
+            elif kind == b"mtllib":
+                libraries.append(_name(tail))
             elif kind == b"s":
                 group = tail.partition(b"#")[0].strip()
             elif kind not in _HARMLESS and not kind.startswith(b"#"):
@@ -194,11 +178,11 @@ def _statements(source: _Source, *, groups: bool) -> tuple[list[_Rows], _Faces, 
     joined = _Faces(*map(np.concatenate, zip(empty, *faces, strict=True)))
     if (smoothed & {b"off", b"0"} or len(smoothed) > 1) and (joined.corner[:, 2] == _NONE).any():
         ignored.add("smoothing groups (s) of faces without normals")
-    return [_rows(parts) for parts in rows.values()], joined, ignored
+    return [_rows(parts) for parts in rows.values()], joined, list(regions), libraries, ignored
 
 
 def _name(tail: bytes) -> str:
-    return statement(text.name(tail.replace(b"\t", b" ")))
+    return _statement(text.name(tail.replace(b"\t", b" ")))
 
 
 def _numbers(tails: list[bytes], kind: bytes, places: list[int], source: _Source) -> np.ndarray:
@@ -345,29 +329,25 @@ def _extra_numbers(vertex: np.ndarray) -> set[str]:
 
 
 def materials_of_regions(
-    path: pathlib.Path, plain: TexturedMaterial, unread: Set[str], *, outside: bool = False
-) -> tuple[list[str], list[TexturedMaterial]]:
-    """Names and materials of the regions of an OBJ file, in the order of their first faces.
+    path: pathlib.Path, content: MeshContent, plain: TexturedMaterial, *, outside: bool
+) -> tuple[list[TexturedMaterial], set[str]]:
+    """The material of each region of an OBJ file, and what is missing (MTL files, materials, images) or not read.
 
-    A single warning names everything that is missing (MTL files, materials, images) or not read. Missing materials
-    are replaced by `plain`. Materials that no face has are not read. Textures of one image share it.
+    Materials that no face has are not read. Textures of one image share it.
 
     Args:
         path: The OBJ file.
+        content: What the file holds.
         plain: Material of faces without one.
-        unread: What of the geometry is not read, for the warning.
         outside: Whether MTL files and images may be outside of the folder of the OBJ file.
     """
-    source = content(path)
-    order, files = used_materials(source)
     materials: dict[str, TexturedMaterial] = {}
-    ignored = set(unread)
+    ignored, wanted = set(content.ignored), {name or "" for name in content.names}
     earlier: dict[str, dict[str, list[str]]] = {}
-    first = text.name(source.partition(b"\n")[0])
-    pictures = TextureImages()
+    pictures, blender = TextureImages(), _exponent(content.comment)
     read_already: set[pathlib.Path] = set()
     refer = functools.partial(inputs.reference, folder=path.parent, outside=outside)
-    for file in files:
+    for file in content.libraries:
         named = refer(file, path.parent, owner=f"{path}, mtllib")
         words = file.split() if inputs.absence(named) else []
         for library in [refer(word, path.parent, owner=f"{path}, mtllib") for word in words] or [named]:
@@ -376,14 +356,10 @@ def materials_of_regions(
                 ignored.add(f"mtllib ({library}, {absence})")
             elif (target := library.resolve()) not in read_already:
                 read_already.add(target)
-                wanted = {label or "" for label in order}
-                material, more = read_mtl(
-                    library, wanted, earlier, blender=_exponent(first), refer=refer, pictures=pictures
-                )
+                material, more = read_mtl(library, wanted, earlier, blender=blender, refer=refer, pictures=pictures)
                 materials, ignored = material | materials, ignored | more
-    ignored |= {f"usemtl {label} (no such material)" for label in order if label is not None and label not in materials}
-    warn_of_ignored(path, ignored, stacklevel=3)
-    return [label or "default" for label in order], [materials.get(label or "", plain) for label in order]
+    ignored |= {f"usemtl {name} (no such material)" for name in content.names if name and name not in materials}
+    return [materials.get(name or "", plain) for name in content.names], ignored
 
 
 def _exponent(line: str) -> float | None:
@@ -442,9 +418,9 @@ def read_mtl(
     if not lines or not lines[0].startswith("# Blender"):
         blender = None
     for line in lines:
-        key, rest = [*_WHITE.split(statement(line), maxsplit=1), ""][:2]
+        key, rest = [*_WHITE.split(_statement(line), maxsplit=1), ""][:2]
         if key == "newmtl":
-            name = statement(rest.replace("\t", " "))
+            name = _statement(rest.replace("\t", " "))
             previous = named.get(name)
             named[name] = statements = {}
             several |= {name: previous} if previous else {}

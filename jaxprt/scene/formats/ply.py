@@ -1,6 +1,5 @@
 """Geometry of PLY files: the header, tables of elements in text or in bytes, and the mesh in them."""
 
-import collections
 import pathlib
 import re
 import struct
@@ -14,26 +13,10 @@ from jaxprt.files import inputs
 from jaxprt.scene.formats import geometry, text
 from jaxprt.scene.formats.geometry import MeshContent, Polygons, first_appearance
 
-_TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "float": "f4",
-    "double": "f8",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "int64": "i8",
-    "uint64": "u8",
-    "float32": "f4",
-    "float64": "f8",
-}
+# Types of numbers, by the names of the first version of the format and by those of the second.
+_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4"}
+_TYPES |= {"double": "f8", "float32": "f4", "float64": "f8"}
+_TYPES |= {f"{sign}int{8 * size}": f"{sign or 'i'}{size}" for sign in ("", "u") for size in (1, 2, 4, 8)}
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}  # of struct
 _BLOCK, _BYTES = 1 << 16, 1 << 24  # most rows with lists, and bytes of them, that are read at once
@@ -82,21 +65,13 @@ class Element(NamedTuple):
 
 
 class PlyHeader(NamedTuple):
-    """The header of a PLY file.
+    """The header of a PLY file."""
 
-    Attributes:
-        order: Byte order, "<" or ">"; "" for text.
-        elements: The elements, in the order of their tables.
-        comments: Comments without their keyword.
-        unknown: Keywords that the format does not have.
-        end: Position of the first byte after the header.
-    """
-
-    order: str
-    elements: list[Element]
-    comments: list[str]
-    unknown: set[str]
-    end: int
+    order: str  # of bytes, "<" or ">"; "" for text
+    elements: list[Element]  # in the order of their tables
+    comments: list[str]  # without their keyword
+    unknown: set[str]  # keywords that the format does not have
+    end: int  # position of the first byte after the header
 
 
 Columns = dict[str, np.ndarray | Lists]
@@ -184,13 +159,12 @@ def read_elements(content: bytes, header: PlyHeader, names: set[str], lists: set
         if not element.properties:
             continue
         read = element.name in names
-        if rows is not None:
-            columns = (_columns(table, element, lists) for table in text.tables(rows, element.rows, element.name))
-            blocks = [block for block in columns if read]  # other rows are read too, because the next ones follow
-        elif all(item.length is None for item in element.properties):
-            blocks, at = [_fixed_columns(content, at, element)], at + element.rows * element.row_size
+        used = lists if read else set()
+        if rows is None:
+            blocks, at = _binary(content, at, element, used)
         else:
-            blocks, at = _variable(content, at, element, lists if read else None)
+            columns = (_columns(table, element, used) for table in text.tables(rows, element.rows, element.name))
+            blocks = [block for block in columns if read]  # other rows are read too, because the next ones follow
         if read:
             tables[element.name] = _join_blocks(blocks, element)
     return tables
@@ -217,25 +191,14 @@ def _cast(value: np.ndarray, dtype: np.dtype) -> np.ndarray:
     return np.clip(value, limit.min, limit.max).astype(dtype) if limit.bits < 64 else value
 
 
-def _fixed_columns(content: bytes, at: int, element: Element) -> Columns:
-    """The columns of rows without lists."""
-    fields = [(f"{index}", item.dtype) for index, item in enumerate(element.properties)]
-    row = np.frombuffer(content, np.dtype(fields), element.rows, at)
-    return {item.name: row[f"{index}"] for index, item in enumerate(element.properties)}
-
-
-def _variable(content: bytes, at: int, element: Element, lists: set[str] | None) -> tuple[list[Columns], int]:
-    """The columns of rows with lists, in blocks, and the position after the last row. Without `lists`, no columns."""
+def _binary(content: bytes, at: int, element: Element, lists: set[str]) -> tuple[list[Columns], int]:
+    """The columns of rows in bytes, in blocks, and the position after the last row."""
     if not element.rows:
         return [], at
     equal = _equal_rows(content, at, element)
     if equal is not None:
-        return [] if lists is None else [_equal_columns(equal, element, lists)], at + equal.nbytes
-    starts = _row_starts(content, at, element)
-    if lists is None:
-        (end,) = collections.deque(starts, maxlen=1)
-        return [], end
-    start = np.fromiter(starts, np.int64, element.rows + 1)
+        return [_equal_columns(equal, element, lists)], at + equal.nbytes
+    start = np.fromiter(_row_starts(content, at, element), np.int64, element.rows + 1)
     byte = np.frombuffer(content, np.uint8)
     blocks, first = [], 0
     while first < element.rows:
@@ -277,7 +240,7 @@ def _within(start: np.ndarray, end: np.ndarray, size: int) -> np.ndarray:
 
 
 def _equal_rows(content: bytes, at: int, element: Element) -> np.ndarray | None:
-    """A view of rows whose lists are all as long as those of the first row; None if they are not."""
+    """A view of rows whose lists, if any, are all as long as those of the first row; None if they are not."""
     fields, offset = [], at
     for index, item in enumerate(element.properties):
         size = 1
@@ -289,10 +252,9 @@ def _equal_rows(content: bytes, at: int, element: Element) -> np.ndarray | None:
             return None
         fields.append((f"{index}", item.dtype, (size,)))
         offset += size * item.dtype.itemsize
-    dtype = np.dtype(fields)
-    if at + element.rows * dtype.itemsize > len(content):
+    if at + element.rows * (offset - at) > len(content):
         return None
-    row = np.frombuffer(content, dtype, element.rows, at)
+    row = np.frombuffer(content, np.dtype(fields), element.rows, at)
     counts = (row[f"length {index}"] for index, item in enumerate(element.properties) if item.length is not None)
     return None if any((count != count[0]).any() for count in counts) else row
 
@@ -304,9 +266,9 @@ def _equal_columns(row: np.ndarray, element: Element, lists: set[str]) -> Column
         value = row[f"{index}"]
         if item.length is None:
             columns[item.name] = value[:, 0]
-            continue
-        items = value.reshape(-1) if item.name in lists else np.zeros(0, item.dtype)
-        columns[item.name] = Lists(items, row[f"length {index}"].astype(np.int64))
+        else:
+            items = value.reshape(-1) if item.name in lists else np.zeros(0, item.dtype)
+            columns[item.name] = Lists(items, row[f"length {index}"].astype(np.int64))
     return columns
 
 
@@ -339,16 +301,16 @@ def _row_starts(content: bytes, at: int, element: Element) -> Iterator[int]:
 
 def _join_blocks(blocks: list[Columns], element: Element) -> Columns:
     """Joins the columns of blocks."""
+    if len(blocks) == 1:
+        return blocks[0]
     columns: Columns = {}
     for item in element.properties:
         parts = [block[item.name] for block in blocks]
-        empty = np.zeros(0, item.dtype), np.zeros(0, np.int64)
-        if len(parts) == 1:
-            columns[item.name] = parts[0]
-        elif item.length is None:
-            columns[item.name] = np.concatenate(parts) if parts else empty[0]
+        if item.length is None:
+            columns[item.name] = np.concatenate(parts) if parts else np.zeros(0, item.dtype)
         else:
-            columns[item.name] = Lists(*map(np.concatenate, zip(*parts, strict=True))) if parts else Lists(*empty)
+            empty = Lists(np.zeros(0, item.dtype), np.zeros(0, np.int64))
+            columns[item.name] = Lists(*map(np.concatenate, zip(*parts, strict=True))) if parts else empty
     return columns
 
 
@@ -363,29 +325,22 @@ def read(path: pathlib.Path) -> MeshContent:
         path: The file.
 
     Raises:
-        ValueError: The file is damaged. The message names the file.
+        ValueError: The file is damaged.
     """
     content = inputs.content(path, "a mesh file").removeprefix(_UTF8_MARK)
-    try:
-        header = read_header(content)
-        advice = "free some memory, or write the file in parts"
-        require.memory(f"the elements of {path}", table_memory(header, len(content)), advice)
-        table = read_elements(content, header, {"vertex", "face", *_STRIPS}, {*_CORNERS, _WEDGES})
-        vertex, face = table.get("vertex", {}), table.get("face", {})
-        if not all(isinstance(vertex.get(axis), np.ndarray) for axis in "xyz"):
-            raise ValueError("its vertices must have the properties x, y and z")
-        faces, corners = _faces(face, table)
-        position = np.stack([vertex[axis] for axis in "xyz"], -1).astype(np.float64)
-        if not faces.size.size or faces.size.max() < 3:
-            raise ValueError(f"{path} must hold vertices and faces, got no faces")
-        geometry.check_polygons(faces, len(position), str(path))
-        images = [match[1].strip() for comment in header.comments if (match := _IMAGE.match(comment))]
-        mesh = _ply_content(position, vertex, face, faces, corners, images, str(path))
-        return mesh._replace(ignored=mesh.ignored | _unread(header))
-    except ValueError as error:
-        if str(error).startswith(str(path)):
-            raise
-        raise text.unreadable(path, "PLY", error) from error
+    header = read_header(content)
+    advice = "free some memory, or write the file in parts"
+    require.memory(f"the elements of {path}", table_memory(header, len(content)), advice)
+    table = read_elements(content, header, {"vertex", "face", *_STRIPS}, {*_CORNERS, _WEDGES})
+    vertex, face = table.get("vertex", {}), table.get("face", {})
+    if not all(isinstance(vertex.get(axis), np.ndarray) for axis in "xyz"):
+        raise ValueError("its vertices must have the properties x, y and z")
+    faces, corners = _faces(face, table)
+    position = np.stack([vertex[axis] for axis in "xyz"], -1).astype(np.float64)
+    geometry.check_polygons(faces, len(position), str(path))
+    images = [match[1].strip() for comment in header.comments if (match := _IMAGE.match(comment))]
+    mesh = _ply_content(position, vertex, face, faces, corners, images, str(path))
+    return mesh._replace(ignored=mesh.ignored | _unread(header))
 
 
 def _unread(header: PlyHeader) -> set[str]:
@@ -415,8 +370,7 @@ def _faces(face: Columns, table: dict[str, Columns]) -> tuple[Polygons, int]:
             if isinstance(strips, Lists):
                 vertex = text.whole_lists(*strips, element)
                 parts.append(geometry.polygons_of_rows(_strip_triangles(vertex, strips.length)))
-    if not parts:
-        return Polygons(np.zeros(0, np.int64), np.zeros(0, np.int64)), 0
+    parts = parts or [Polygons(np.zeros(0, np.int64), np.zeros(0, np.int64))]
     return Polygons(*map(np.concatenate, zip(*parts, strict=True))), corners
 
 

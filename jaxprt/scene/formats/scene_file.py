@@ -158,11 +158,11 @@ def load_scene(
     content = mesh_file.content(path, groups=False)
     plain = file_parts.matte(geometry=content.geometry)
     if path.suffix.lower() == ".obj":
-        names, materials = obj.materials_of_regions(path, plain, content.ignored, outside=outside)
-        if names == ["default"]:
-            names = [path.stem]
+        materials, ignored = obj.materials_of_regions(path, content, plain, outside=outside)
+        names = [name or "default" for name in content.names]
+        names = [path.stem] if names == ["default"] else names
     else:
         materials, ignored = file_parts.materials_of_images(content, plain, path, outside=outside)
         names = [path.stem] * len(materials)
-        file_parts.warn_of_ignored(path, ignored, stacklevel=2)
+    file_parts.warn_of_ignored(path, ignored, stacklevel=2)
     return Scene(split_parts(file_parts.with_base_color(content.geometry, materials, plain), names, materials, path))

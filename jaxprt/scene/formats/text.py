@@ -1,6 +1,7 @@
 """Text files: their encodings and line ends, and conversion of their words to numbers."""
 
 import codecs
+import contextlib
 import io
 import itertools
 import pathlib
@@ -34,9 +35,7 @@ def read(path: pathlib.Path, what: str) -> bytes:
         what: Kind of the file for messages, such as "an OBJ file".
 
     Raises:
-        FileNotFoundError: The file does not exist.
         ValueError: It is not a regular file, or not text.
-        MemoryError: It does not fit into memory.
     """
     content = inputs.content(path, what)
     try:
@@ -69,17 +68,11 @@ def name(word: bytes) -> str:
 
 
 class Words(NamedTuple):
-    """The words of rows of text.
+    """The words of rows of text."""
 
-    Attributes:
-        text: The rows, with line feeds between them.
-        start: Position of the first byte of each word.
-        per_row: Number of words of each row.
-    """
-
-    text: bytes
-    start: np.ndarray
-    per_row: np.ndarray
+    text: bytes  # the rows, with line feeds between them
+    start: np.ndarray  # position of the first byte of each word
+    per_row: np.ndarray  # number of words of each row
 
 
 def words(rows: Sequence[bytes]) -> Words:
@@ -94,11 +87,7 @@ def words(rows: Sequence[bytes]) -> Words:
 
 
 class RowError(ValueError):
-    """A row of words that are not all numbers, or too few.
-
-    Attributes:
-        row: Index of the row.
-    """
+    """A row of words, the index of which is `row`, that are not all numbers, or too few."""
 
     def __init__(self, row: int):
         super().__init__(f"row {row} has words that are not numbers, or too few")
@@ -106,12 +95,7 @@ class RowError(ValueError):
 
 
 def numbers(words: Words, *, kind: type = float) -> np.ndarray:
-    """Numbers from words, in 64 bits.
-
-    Args:
-        words: The words.
-        kind: float or int. Integers beyond 64 bits become the nearest one.
-    """
+    """Numbers from words, as float or int in 64 bits. Integers beyond these become the nearest one."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # older NumPy only warns of words that are not numbers
         number = _parse(words.text, len(words.start), kind)
@@ -168,18 +152,12 @@ class Table:
     def lists(self, rest: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """The next list of each row: all items, and the length of each list."""
         start, number = self._at, self.column(rest)
-        wrong = np.flatnonzero(has_fraction(number))
-        if wrong.size:
-            raise ValueError(
-                f"row {self._first + wrong[0] + 1} of the {self._what} rows must have a list of 0 or more numbers, "
-                f"got {number[wrong[0]]}"
-            )
         count = whole(number)
-        wrong = np.flatnonzero(count < 0)
+        wrong = np.flatnonzero(has_fraction(number) | (count < 0))
         if wrong.size:
             raise ValueError(
                 f"row {self._first + wrong[0] + 1} of the {self._what} rows must have a list of 0 or more numbers, "
-                f"got {count[wrong[0]]}"
+                f"got {number[wrong[0]]:g}"
             )
         count = np.minimum(count, len(self._number) + 1)
         self._require(start + 1 + count + rest)
@@ -204,16 +182,7 @@ class Table:
 
 
 def tables(rows: Iterator[bytes], count: int, what: str) -> Iterator[Table]:
-    """Blocks of the next `count` rows.
-
-    Args:
-        rows: Rows that are not empty.
-        count: Number of rows to read.
-        what: Name of the rows for messages, such as "vertex".
-
-    Raises:
-        ValueError: There are fewer rows, or rows that are not numbers.
-    """
+    """Blocks of the next `count` rows, named `what` in messages. Refuses fewer rows, and those that are not numbers."""
     for first in range(0, count, _BLOCK):
         size = min(_BLOCK, count - first)
         block = list(itertools.islice(rows, size))
@@ -241,13 +210,7 @@ def whole(value: np.ndarray) -> np.ndarray:
 
 
 def whole_lists(value: np.ndarray, length: np.ndarray, what: str) -> np.ndarray:
-    """Integers in 64 bits, as `whole` gives them, from the items of lists.
-
-    Args:
-        value: All items, one list after the other.
-        length: The length of each list.
-        what: Name of the rows for messages, such as "face".
-    """
+    """Integers in 64 bits, as `whole` gives them, from the items of lists of given lengths, in rows named `what`."""
     wrong = np.flatnonzero(has_fraction(value))
     if wrong.size:
         row = np.searchsorted(np.cumsum(length), wrong[0], side="right")
@@ -261,6 +224,19 @@ def list_indices(start: np.ndarray, count: np.ndarray) -> np.ndarray:
     return np.arange(end[-1] if len(end) else 0) + np.repeat(start - (end - count), count)
 
 
-def unreadable(path: pathlib.Path, kind: str, detail: object) -> ValueError:
-    """The error for a damaged file of a kind such as "PLY"."""
-    return ValueError(f"{path} must be an undamaged {kind} file, got one that cannot be read: {detail}")
+@contextlib.contextmanager
+def name_file_in_errors(path: pathlib.Path, kind: str) -> Iterator[None]:
+    """Makes all errors that a damaged file of a kind, such as "glTF", causes name the file."""
+    must = f"{path} must be an undamaged {kind} file, got one that"
+    try:
+        yield
+    except KeyError as error:
+        raise ValueError(f"{must} lacks {error} where it is needed") from error
+    except (IndexError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise ValueError(f"{must} cannot be read: {type(error).__name__}: {error}") from error
+    except (ValueError, MemoryError) as error:
+        if str(path) in str(error):
+            raise
+        if isinstance(error, MemoryError):
+            raise MemoryError(f"{path}: {error}") from error
+        raise ValueError(f"{must} cannot be read: {error}") from error

@@ -3,10 +3,8 @@
 Lights of glTF files, against three.js (`peers/three_poses.mjs`).
 """
 
-import copy
 import json
 import pathlib
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -456,78 +454,6 @@ def test_buffers_and_images_are_read_from_files_beside(tmp_path):
         load_scene(path)
 
 
-def sound(folder):
-    """A file with everything that can be damaged."""
-    writer = Writer()
-    info = writer.texture(folder, IMAGE, extensions={"KHR_texture_transform": {"scale": [1, 2]}})
-    pbr = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0.5, "baseColorTexture": info}
-    writer.header["materials"] = [{"pbrMetallicRoughness": pbr, "normalTexture": info}]
-    one(writer.square(material=0, TEXCOORD_0=PLACE, NORMAL=SQUARE), writer=writer)
-    writer.header["nodes"] = [{"mesh": 0, "children": [1]}, {"camera": 0, "scale": [1, 1, 1]}]
-    writer.header["cameras"] = [{"type": "perspective", "perspective": {"yfov": 0.7}}]
-    return writer
-
-
-DAMAGES = {
-    "accessors.0.count": (
-        5,
-        r"accessor 0 \(POSITION of primitive 0 of mesh 0\) inside buffer view \d of 48 bytes, got 5",
-    ),
-    "accessors.0.byteOffset": (-4, r"whole number of at least 0 for byteOffset of accessor 0 \(POSITION .*, got -4"),
-    "accessors.0.componentType": (5130, "must have 3 numbers per element .* got type 'VEC3' of component type 5130"),
-    "accessors.1.count": (3, r"must have 4 elements in TEXCOORD_0 .*, as in POSITION, got 3"),
-    "accessors.3.componentType": (5126, "must have 1 whole numbers per element"),
-    "accessors.3.bufferView": (99, r"must refer to one of its \d bufferViews in accessor 3 \(indices of .*\), got 99"),
-    "bufferViews.1.byteLength": (10**6, r"must have buffers of at least \d+ bytes for buffer view 1, got \d+ bytes"),
-    "meshes.0.primitives.0.attributes": ({}, "must be an undamaged glTF file, got one that lacks 'POSITION'"),
-    "nodes.0.children": ([0], "must have nodes that form trees, got node 0 twice, the second time in node 0"),
-    "nodes.1.camera": (-1, "must refer to one of its 1 cameras in node 1, got -1"),
-    "nodes.1.scale": ([0, 0, 0], "must have invertible transforms for camera 0, got a scale of zero"),
-    "nodes.0.matrix": (
-        [1, 0, 0, 5, 0, 1, 0, 6, 0, 0, 1, 7, 0, 0, 0, 1],
-        r"must have a matrix by columns, the last row of which is 0 0 0 1, in node 0, got \[5\.0, 6\.0, 7\.0, 1\.0\]",
-    ),
-    "nodes.1.rotation": ([0, 0, 0, 0], "must have a nonzero quaternion for the rotation of node 1, got zero"),
-    "nodes.1.translation": ([0, float("nan"), 0], "must have 3 finite numbers for the translation of node 1, got"),
-    "scenes.0": ({}, "must hold vertices and faces, got no faces"),
-    "materials.0.pbrMetallicRoughness.metallicFactor": (
-        float("nan"),
-        "a finite number for metallicFactor of material 0",
-    ),
-    "materials.0.pbrMetallicRoughness.roughnessFactor": (1.5, "material 0: roughness .* between 0 and 1, .* 1.5"),
-    "materials.0.pbrMetallicRoughness.baseColorFactor": ([1, 1, 1], "4 finite numbers for baseColorFactor"),
-    "materials.0.pbrMetallicRoughness.baseColorTexture.index": (
-        4,
-        "one of its 1 textures in baseColorTexture of material 0",
-    ),
-    "cameras.0.perspective.yfov": (4, "must have yfov from 0 to pi"),
-    "asset.version": ("1.0", "of version 2, got version 1.0"),
-    "extensionsRequired": (["EXT_a", "EXT_b"], "must not require extensions other than .*, got EXT_a, EXT_b$"),
-    "accessors": ("none", "with a list of accessors, got str"),
-}
-
-
-def changed(header, place, value):
-    """A header with another value at a place "kind.number.key"."""
-    header = copy.deepcopy(header)
-    *way, last = [int(key) if key.isdigit() else key for key in place.split(".")]
-    item: Any = header
-    for key in way:
-        item = item[key]
-    item[last] = value
-    return header
-
-
-@pytest.mark.parametrize("place", DAMAGES)
-def test_damaged_headers_are_refused_by_what_was_required_and_what_came(tmp_path, place):
-    value, message = DAMAGES[place]
-    writer = sound(tmp_path)
-    writer.header = changed(writer.header, place, value)
-    with pytest.raises(ValueError, match=message) as error:
-        load_scene(writer.write(tmp_path / "damaged.glb"))
-    assert "damaged.glb" in str(error.value)
-
-
 def test_indices_beyond_the_vertices_are_refused(tmp_path):
     writer = one((writer := Writer()).square(face=np.array([0, 1, 2, 0, 2, 9], np.uint8)), writer=writer)
     message = r"refer to vertices 0 to 3 in indices of primitive 0 of mesh 0, got 1 of 6 .* first is 9 at 5"
@@ -541,24 +467,6 @@ def test_positions_that_are_not_finite_are_refused(tmp_path):
     writer = one((writer := Writer()).square(POSITION=position), writer=writer)
     with pytest.raises(ValueError, match=r"nan\.glb: positions must be finite, got 1 of 4 .* at vertex 2"):
         load_scene(writer.write(tmp_path / "nan.glb"))
-
-
-def test_files_that_are_cut_off_or_something_else_are_refused(tmp_path):
-    content = sound(tmp_path).write(tmp_path / "whole.glb").read_bytes()
-    load_scene(tmp_path / "whole.glb")
-    path = tmp_path / "broken.glb"
-    for size in (0, 3, 11, 19, 25, 200, len(content) // 2, len(content) - 1):
-        path.write_bytes(content[:size])
-        with pytest.raises(ValueError, match=r"broken\.glb must be an undamaged GLB file"):
-            load_scene(path)
-    path.write_bytes(content[:9])
-    with pytest.raises(ValueError, match=r"of at least 20 bytes, its two headers, got 9$"):
-        load_scene(path)
-    path.write_bytes(b"glTX" + content[4:])
-    with pytest.raises(ValueError, match=r"which starts with the text glTF, got the bytes 67 6c 54 58$"):
-        load_scene(path)
-    with pytest.raises(FileNotFoundError, match=r"absent\.glb must be a glTF file, and there is no such file"):
-        load_scene(tmp_path / "absent.glb")
 
 
 def test_all_textures_are_transformed_and_coats_and_transmission_are_read(tmp_path):
@@ -664,7 +572,7 @@ DAMAGE = {
         light=4
     ),
     r"must have a string for type of light 0, got 3": lambda _, lights: lights[0].update(type=3),
-    r"must have a finite number for the intensity of light 1, got inf": lambda _, lights: lights[1].update(
+    r"must have a finite number for intensity of light 1, got inf": lambda _, lights: lights[1].update(
         intensity=float("inf")
     ),
     r"must have an intensity and a color of at least 0 in light 0": lambda _, lights: lights[0].update(intensity=-1),

@@ -119,6 +119,7 @@ def outcome(path: pathlib.Path) -> str:
     return message
 
 
+ROWS = [1, 0, 0, 5, 0, 1, 0, 6, 0, 0, 1, 7, 0, 0, 0, 1]  # of a matrix, which must be by columns
 # One case for each kind of check; the test of all values of a header reaches the others.
 TYPES = [
     (("nodes", 0, "mesh"), True, r"must refer to one of its 2 meshes in node 0, got True"),
@@ -133,6 +134,52 @@ TYPES = [
     (("nodes", 2), "node", r"with a list of nodes, all of them objects, got 'node' at 2"),
     (("nodes",), {"0": {}}, r"with a list of nodes, got dict"),
     (("scenes", 0, "nodes"), [0, 0], r"nodes that form trees, got node 0 twice, the second time in scene 0"),
+    (
+        ("accessors", 0, "count"),
+        5,
+        r"keep accessor 0 \(POSITION of primitive 0 of mesh 0\) inside .* of 48 bytes, got 5",
+    ),
+    (
+        ("accessors", 0, "byteOffset"),
+        -4,
+        r"whole number of at least 0 for byteOffset of accessor 0 \(POSITION .*, got -4",
+    ),
+    (
+        ("accessors", 0, "componentType"),
+        5130,
+        "must have 3 numbers per element .* got type 'VEC3' of component type 5130",
+    ),
+    (("accessors", 1, "count"), 3, r"must have 4 elements in TEXCOORD_0 .*, as in POSITION, got 3"),
+    (("accessors", 3, "componentType"), 5126, "must have 1 whole numbers per element"),
+    (
+        ("accessors", 3, "bufferView"),
+        99,
+        r"refer to one of its \d+ bufferViews in accessor 3 \(indices of .*\), got 99",
+    ),
+    (("meshes", 0, "primitives", 0, "attributes"), {}, "be an undamaged glTF file, got one that lacks 'POSITION'"),
+    (("nodes", 0, "children"), [0], "must have nodes that form trees, got node 0 twice, the second time in node 0"),
+    (("nodes", 1, "camera"), -1, "must refer to one of its 1 cameras in node 1, got -1"),
+    (("nodes", 1, "scale"), [0, 0, 0], "must have invertible transforms for camera 0, got a scale of zero"),
+    (
+        ("nodes", 2, "matrix"),
+        ROWS,
+        r"by columns, the last row of which is 0 0 0 1, in node 2, got \[5\.0, 6\.0, 7\.0, 1\.0\]",
+    ),
+    (("nodes", 0, "rotation"), [0, 0, 0, 0], "must have a nonzero quaternion for the rotation of node 0, got zero"),
+    (("nodes", 1, "translation"), [0, NAN, 0], "must have 3 finite numbers for the translation of node 1, got"),
+    (("scenes", 0), {}, "must hold vertices and faces, got no faces"),
+    (
+        ("materials", 0, "pbrMetallicRoughness", "metallicFactor"),
+        NAN,
+        "a finite number for metallicFactor of material 0",
+    ),
+    (("materials", 0, "pbrMetallicRoughness", "baseColorFactor"), [1, 1, 1], "4 finite numbers for baseColorFactor"),
+    (("materials", 0, "pbrMetallicRoughness", "roughnessFactor"), 1.5, r"be between 0 and 1, .* 1\.5"),
+    (("materials", 0, "normalTexture", "index"), 4, r"one of its 1 textures in \w+Texture of material 0"),
+    (("cameras", 0, "perspective", "yfov"), 4, "must have yfov from 0 to pi"),
+    (("asset", "version"), "1.0", "of version 2, got version 1.0"),
+    (("extensionsRequired",), ["EXT_a", "EXT_b"], "must not require extensions other than .*, got EXT_a, EXT_b$"),
+    (("accessors",), "none", "with a list of accessors, got str"),
     (("skins", 0, "joints"), [], r"must have one or more joints in skin 0, got none"),
     (("meshes", 0, "primitives"), [4], r"must have an object for primitive 0 of mesh 0, got 4"),
     (("meshes", 0, "primitives", 0, "mode"), 7, r"must have a mode from 0 to 6 in primitive 0 of mesh 0, got 7"),
@@ -168,8 +215,26 @@ TYPES = [
 def test_fields_of_wrong_types_are_refused_by_name(tmp_path, way, value, message):
     writer = everything(tmp_path)
     writer.header = changed(writer.header, way, value)
-    with pytest.raises(ValueError, match=rf"wrong\.glb must .*{message.removeprefix('must ')}"):
+    with pytest.raises(ValueError, match=rf"wrong\.glb.* must .*{message.removeprefix('must ')}"):
         load_scene(writer.write(tmp_path / "wrong.glb"))
+
+
+def test_files_that_are_cut_off_or_something_else_are_refused(tmp_path):
+    content = everything(tmp_path).write(tmp_path / "whole.glb").read_bytes()
+    load_scene(tmp_path / "whole.glb")
+    path = tmp_path / "broken.glb"
+    for size in (0, 3, 11, 19, 25, 200, len(content) // 2, len(content) - 1):
+        path.write_bytes(content[:size])
+        with pytest.raises(ValueError, match=r"broken\.glb must be an undamaged GLB file"):
+            load_scene(path)
+    path.write_bytes(content[:9])
+    with pytest.raises(ValueError, match=r"of at least 20 bytes, its two headers, got 9$"):
+        load_scene(path)
+    path.write_bytes(b"glTX" + content[4:])
+    with pytest.raises(ValueError, match=r"which starts with the text glTF, got the bytes 67 6c 54 58$"):
+        load_scene(path)
+    with pytest.raises(FileNotFoundError, match=r"absent\.glb must be a glTF file, and there is no such file"):
+        load_scene(tmp_path / "absent.glb")
 
 
 def test_required_extensions_must_be_a_list_of_strings_for_meshes_too(tmp_path):
