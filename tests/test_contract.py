@@ -83,7 +83,7 @@ HOST = {
     "image.pixels.shading_points": "has more padding in jit than outside; tests/image/test_pixels.py",
     "visibility.rays": "traces rays",
     "visibility.occluder": "traces rays",
-    "visibility.packets": "traces rays",
+    "visibility.embree": "traces rays",
     "visibility.blocks": "runs workers and writes files",
     "visibility.refinement": "traces rays, and chooses by values",
     "systems.separable.sparse.precompute": "traces rays",
