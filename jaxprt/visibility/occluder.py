@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from jaxtyping import Bool, Float32, Int, Integer
+from jaxtyping import Bool, Float32, Integer
 
 from jaxprt.scene.mesh import Mesh
-from jaxprt.scene.subdivision import places
+from jaxprt.scene.subdivision import orientations
 
 # Offset of ray origins from a triangle, in spacings of float32 at its largest coordinate. With four (rays from
 # vertices) or eight (from points inside of slivers), none of 60,000 rays hits the random triangle that it starts from,
@@ -183,27 +183,6 @@ class Occluder:
         hit = self._run(origin, direction, query="INTERSECT", output=True)
         u, v = hit["u"], hit["v"]
         return hit["primID"].astype(np.int64), hit["tfar"], np.stack([1 - u - v, u, v], -1)
-
-
-def orientations(
-    position: Float32[np.ndarray, "v 3"], face: Integer[np.ndarray, "f 3"]
-) -> tuple[Int[np.ndarray, " f"], Int[np.ndarray, " f"], Int[np.ndarray, "f 3"]]:
-    """What coincident faces have in common.
-
-    Args:
-        position: Positions of the vertices.
-        face: Vertex indices of each triangle.
-
-    Returns:
-        A number that faces with corners at the same positions share; 0 or 1, which differ between opposite
-        orientations; and for each face the order of its corners that all such faces share.
-    """
-    corner = places(position)[face]
-    order = np.argsort(corner, axis=1)
-    _, alike = np.unique(np.take_along_axis(corner, order, 1), axis=0, return_inverse=True)
-    # Odd permutations of the sorted corners have one orientation, even permutations the other.
-    odd = (order[:, 0] > order[:, 1]) ^ (order[:, 0] > order[:, 2]) ^ (order[:, 1] > order[:, 2])
-    return alike.reshape(-1), odd.astype(int), order
 
 
 def offsets(position: Float32[np.ndarray, "v 3"], face: Integer[np.ndarray, "f k"]) -> Float32[np.ndarray, " f"]:

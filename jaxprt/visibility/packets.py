@@ -14,8 +14,8 @@ from numba.core import types
 from jaxprt.compile import numba_loop
 from jaxprt.scene import texture
 from jaxprt.scene.mesh import BLEND, CLEAR, Opacity
+from jaxprt.scene.subdivision import orientations
 from jaxprt.visibility import embree
-from jaxprt.visibility.occluder import orientations
 
 LAYERS = 8  # translucent surfaces that a ray collects: the nearest ones
 _PASSED, _FIRST, _LAYERS = 0, 1, 2  # what the filter does with a hit
@@ -207,12 +207,12 @@ def _trace_rays(query, origin, direction, point, way, far, hit):
         embree.trace(query, embree.RAY if hit is None else embree.RAY_HIT)
         for lane in range(count):
             if hit is not None:
-                found = hit[first + lane]
-                found.distance, found.geometry = ray[embree.FAR, lane], number[embree.GEOMETRY, lane]
-                if found.geometry != embree.NONE:
+                stop = hit[first + lane]
+                stop.distance, stop.geometry = ray[embree.FAR, lane], number[embree.GEOMETRY, lane]
+                if stop.geometry != embree.NONE:
                     u, v = ray[embree.U, lane], ray[embree.V, lane]
-                    found.weight[0], found.weight[1], found.weight[2] = np.float32(1) - u - v, u, v
-                    found.primitive = number[embree.PRIMITIVE, lane]
+                    stop.weight[0], stop.weight[1], stop.weight[2] = np.float32(1) - u - v, u, v
+                    stop.primitive = number[embree.PRIMITIVE, lane]
             elif ray[embree.FAR, lane] < 0:
                 share[first + lane] = 0
 

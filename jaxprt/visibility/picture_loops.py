@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from jaxprt.compile import numba_loop
-from jaxprt.visibility.embree import DIRECTION, ENDLESS, FAR, ORIGIN, RAY, trace
+from jaxprt.visibility import embree
 
 _ORIGINS = np.array([[-3, -1], [1, -3], [3, 1], [-1, 3]]) / 8  # ray origins in a pixel, from its center
 _GOLDEN = 0.618  # share of all rays between two turns
@@ -22,10 +22,7 @@ _unchecked = partial(numba_loop, error_model="numpy")
 
 @numba_loop
 def _start(surface, points, point, lane, origin, facing):
-    """Sets ray origins of a point in its pixel, and the unit normal of its triangle on the side of the shading normal.
-
-    The normal is zero in padding and for triangles without an area, which have no side to start from.
-    """
+    """Sets ray origins in a pixel, and its triangle's normal on the shading normal's side: zero if it has no side."""
     position, normal, face, offset = surface
     triangle, barycentric, slope, _ = points
     number = max(triangle[point], 0)
@@ -113,12 +110,12 @@ def trace_shares(query, surface, points, first, last, texels, share):
                     spot = (base // 4 + base + texel + turn) % 4
                     valid[lane] = -1 if above[lane] else 0
                     for axis in range(3):
-                        ray[ORIGIN + axis, lane] = origin[spot, axis, here]
-                        ray[DIRECTION + axis, lane] = direction[texel, stratum, axis]
-                ray[FAR], passed[:] = ENDLESS, 1
-                trace(query, RAY)
+                        ray[embree.ORIGIN + axis, lane] = origin[spot, axis, here]
+                        ray[embree.DIRECTION + axis, lane] = direction[texel, stratum, axis]
+                ray[embree.FAR], passed[:] = embree.ENDLESS, 1
+                embree.trace(query, embree.RAY)
                 for lane in range(lanes):
-                    visible[lane] += passed[lane] if above[lane] and ray[FAR, lane] > 0 else 0.0
+                    visible[lane] += passed[lane] if above[lane] and ray[embree.FAR, lane] > 0 else 0.0
                 traced += 1
             for lane in range(lanes):
                 share[texel, packet + lane] = np.uint8(np.floor(255 * visible[lane] / max(traced, 1) + 0.5))
@@ -194,7 +191,7 @@ def _cast(query, memory, lamps, aim, origin, sight, weight, free):
     for lane in range(16):
         for axis in range(3):
             goal[axis, lane], goal[3 + axis, lane] = lamps[0][sample[lane], axis], lamps[1][sample[lane], axis]
-            ray[ORIGIN + axis, lane] = origin[spot[lane], axis, lane]
+            ray[embree.ORIGIN + axis, lane] = origin[spot[lane], axis, lane]
     zero = np.float32(0)
     for lane in range(16):  # vectorized
         x, y, z = goal[0, lane] - center[0, lane], goal[1, lane] - center[1, lane], goal[2, lane] - center[2, lane]
@@ -205,16 +202,16 @@ def _cast(query, memory, lamps, aim, origin, sight, weight, free):
         height = x * normal[0, lane] + y * normal[1, lane] + z * normal[2, lane]
         cosine[lane] = max(toward, zero) * max(height, zero) / (square * square)
         x, y, z = goal[0, lane] - ray[0, lane], goal[1, lane] - ray[1, lane], goal[2, lane] - ray[2, lane]
-        ray[DIRECTION, lane], ray[DIRECTION + 1, lane], ray[DIRECTION + 2, lane] = x, y, z
-        ray[FAR, lane] = np.float32(1 - _NEAR)
+        ray[embree.DIRECTION, lane], ray[embree.DIRECTION + 1, lane], ray[embree.DIRECTION + 2, lane] = x, y, z
+        ray[embree.FAR, lane] = np.float32(1 - _NEAR)
         above = x * facing[0, lane] + y * facing[1, lane] + z * facing[2, lane]
         valid[lane] = -1 if cosine[lane] > zero and above > zero else 0
     passed[:] = 1
     if valid.min() < 0:
-        trace(query, RAY)
+        embree.trace(query, embree.RAY)
     rays, open_ = 0, 0
     for lane in range(16):
-        seen = valid[lane] != 0 and ray[FAR, lane] > zero
+        seen = valid[lane] != 0 and ray[embree.FAR, lane] > zero
         weight[piece[lane], lane] += cosine[lane]  # irradiance from each sample
         free[piece[lane], lane] += cosine[lane] * passed[lane] if seen else zero  # that from visible samples
         rays += 1 if cosine[lane] > zero else 0

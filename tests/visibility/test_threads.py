@@ -1,12 +1,15 @@
 """Rays from several threads change no memory of others, and give the bits of one thread, on each instruction set."""
 
 import ctypes
+import re
 import sys
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 
+import embreex
 import numpy as np
 import pytest
 
@@ -144,6 +147,15 @@ def test_memory_for_rays_holds_all_that_embree_writes():
     assert packet.nbytes >= 16 * 21 * 4 + 16 * 4  # RTCRayHit16 and which rays are valid
     assert ray.nbytes >= 16 * 21 * 4
     assert all(array.ctypes.data % 64 == 0 for array in (ray, valid, packet))
+
+
+def test_rows_of_rays_are_those_of_the_declarations_that_embreex_ships():
+    text = (Path(embreex.__file__).parent / "rtcore_ray.pxd").read_text()
+    order = re.findall(r"(?:float|unsigned int) (\w+)", text)  # RTCRay, then RTCHit
+    names = ["org_x", "dir_x", "tfar", "mask", "id", "Ng_x", "u", "v", "primID", "geomID"]
+    rows = [embree.ORIGIN, embree.DIRECTION, embree.FAR, embree.MASK, embree.ID]
+    rows += [embree.NORMAL, embree.U, embree.V, embree.PRIMITIVE, embree.GEOMETRY]
+    assert [order.index(name) for name in names] == rows
 
 
 def run_beside(trace: dict[str, Callable[[], bytes]], threads: int, seconds: float) -> list[dict[str, bytes]]:
