@@ -84,6 +84,7 @@ HOST = {
     "visibility.rays": "traces rays",
     "visibility.occluder": "traces rays",
     "visibility.embree": "traces rays",
+    "visibility.picture_loops": "the same, by numba",
     "visibility.blocks": "runs workers and writes files",
     "visibility.refinement": "traces rays, and chooses by values",
     "systems.separable.sparse.precompute": "traces rays",
