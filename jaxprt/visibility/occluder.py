@@ -179,7 +179,7 @@ class Occluder:
                 stop a ray with the probability of their opacity, by a hash of the ray.
         """
         if self.opacity is not None and not solid:
-            return self.packets().hit(origin, direction)
+            return self.packets().hit(np.ascontiguousarray(origin), np.ascontiguousarray(direction))
         hit = self._run(origin, direction, query="INTERSECT", output=True)
         u, v = hit["u"], hit["v"]
         return hit["primID"].astype(np.int64), hit["tfar"], np.stack([1 - u - v, u, v], -1)

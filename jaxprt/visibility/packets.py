@@ -31,11 +31,11 @@ _TABLE = np.dtype([("corners", "i8"), ("image", "i8"), ("texel", "i8")])
 _CONTEXT = np.dtype(
     [("embree", "i4", 16), ("mode", "i8"), ("share", "i8"), ("count", "i8"), ("layer", "i8"), ("hidden", "i8")]
 )
-_inline = partial(numba_loop, inline="always")
-_NO_SHARE = np.ones(0, np.float32)
 _FILTER = np.dtype(  # RTCFilterFunctionNArguments
     [("valid", "i8"), ("table", "i8"), ("context", "i8"), ("ray", "i8"), ("hit", "i8"), ("count", "u4")], align=True
 )
+_NO_SHARE = np.ones(0, np.float32)
+_inline = partial(numba_loop, inline="always")
 
 
 class Packets(embree.Triangles):
