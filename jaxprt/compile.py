@@ -11,6 +11,7 @@ the transpose of a gather is a scatter, which is slower. All of these work under
 import contextlib
 import functools
 import importlib.metadata
+import inspect
 import os
 import warnings
 from collections.abc import Callable
@@ -165,7 +166,8 @@ def numba_loop(function: Callable, **options: Any) -> Callable:
 
     from jaxprt.programs import loops
 
-    return loops.keep(numba.njit(nogil=True, **options)(function))
+    # Run-time checks of types wrap functions, and numba compiles no such wrapper.
+    return loops.keep(numba.njit(nogil=True, **options)(inspect.unwrap(function)))
 
 
 def finished(result: PyTree, between: Between) -> PyTree:

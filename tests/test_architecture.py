@@ -44,7 +44,7 @@ ONLY_IN = {
     "click": "jaxprt.cli",
     "embreex": "jaxprt.visibility.occluder",
     "numba": ("jaxprt.visibility", "jaxprt.compile", "jaxprt.programs.loops"),
-    "llvmlite": ("jaxprt.visibility.packets", "jaxprt.programs.loops"),
+    "llvmlite": ("jaxprt.visibility.embree", "jaxprt.programs.loops"),
     "OpenImageIO": "jaxprt.files",
     "mmap": "jaxprt.files.arrays",
     "jaxopt": "jaxprt.inverse.solve",

@@ -30,7 +30,7 @@ from jaxprt.image import raster
 from jaxprt.programs import executables, jax_cache, loops, store
 from jaxprt.programs.store import Store
 from jaxprt.scene import panorama_loops
-from jaxprt.visibility import alpha_packets, packets
+from jaxprt.visibility import embree, packets, picture_loops
 
 ROOT = pathlib.Path(__file__).parents[1]
 axes = inspect.unwrap(raster.view_axes)  # a small function of a camera
@@ -632,18 +632,21 @@ def shift(x):
 
 
 def test_every_loop_of_the_package_is_kept_under_a_name_of_its_own(loop_files, monkeypatch):
-    modules = packets, alpha_packets, panorama_loops
+    modules = embree, packets, picture_loops, panorama_loops
     every = [value for module in modules for value in vars(module).values() if hasattr(value, "_cache")]
     assert len(every) > 30
     assert len({loops.describe(loop) for loop in every}) == len(every)
-    before = loops.describe(alpha_packets._filter)
-    monkeypatch.setattr(alpha_packets, "_CLEAR", 2 * alpha_packets._CLEAR)  # which `_alpha` reads, and `_filter` calls
-    assert loops.describe(alpha_packets._filter) != before
+    before = loops.describe(packets._filter)
+    turned = np.dtype([(name, "i8") for name in reversed(packets._TABLE.names)])
+    for name, value in {"_CLEAR": 2 * packets._CLEAR, "_TABLE": turned}.items():
+        with monkeypatch.context() as patch:
+            patch.setattr(packets, name, value)  # which `_alpha` reads, and `_filter` calls
+            assert loops.describe(packets._filter) != before
 
 
 def test_a_function_that_c_calls_is_kept_too(loop_files):
     for hits in (0, 1):
-        twice = packets.callback(numba_types.float64(numba_types.float64), doubled)
+        twice = embree.callback(numba_types.float64(numba_types.float64), doubled)
         assert twice.ctypes(4.0) == 8
         assert twice.cache_hits == hits
 

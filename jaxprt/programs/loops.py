@@ -77,6 +77,8 @@ def _texts(value: Any, names: Sequence[str], seen: set) -> Iterator[str]:
         yield repr(value)
     elif isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
         yield f"{value.dtype} {value.shape} {value.tobytes().hex()}"
+    elif isinstance(value, np.dtype):
+        yield f"{value!r} {value.fields}"
     elif isinstance(value, tuple | list):
         yield f"{type(value).__qualname__} {len(value)}"
         for item in value:

@@ -373,6 +373,27 @@ def places(position: np.ndarray) -> np.ndarray:
     return place
 
 
+def orientations(
+    position: Float[np.ndarray, "v 3"], face: Int[np.ndarray, "f 3"]
+) -> tuple[Int[np.ndarray, " f"], Int[np.ndarray, " f"], Int[np.ndarray, "f 3"]]:
+    """What coincident faces have in common.
+
+    Args:
+        position: Positions of the vertices.
+        face: Vertex indices of each triangle.
+
+    Returns:
+        A number that faces with corners at the same positions share; 0 or 1, which differ between opposite
+        orientations; and for each face the order of its corners that all such faces share.
+    """
+    corner = places(position)[face]
+    order = np.argsort(corner, axis=1)
+    _, alike = np.unique(np.take_along_axis(corner, order, 1), axis=0, return_inverse=True)
+    # Odd permutations of the sorted corners have one orientation, even permutations the other.
+    odd = (order[:, 0] > order[:, 1]) ^ (order[:, 0] > order[:, 2]) ^ (order[:, 1] > order[:, 2])
+    return alike.reshape(-1), odd.astype(int), order
+
+
 def joints(position: Float[np.ndarray, "v 3"], face: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "n 2"]:
     """Pairs of vertices at one place whose positions differ by rounding, the lower index first.
 

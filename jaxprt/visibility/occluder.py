@@ -10,6 +10,7 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Bool, Float32, Integer
 
 from jaxprt.scene.mesh import Mesh
+from jaxprt.scene.subdivision import orientations
 
 # Offset of ray origins from a triangle, in spacings of float32 at its largest coordinate. With four (rays from
 # vertices) or eight (from points inside of slivers), none of 60,000 rays hits the random triangle that it starts from,
@@ -62,26 +63,28 @@ class Occluder:
 
     @cached_property
     def _packed(self):
-        """The Embree scene for packets of rays; None if the library that embreex ships has none."""
-        from jaxprt.visibility import packets  # numba takes half a second to import
-
-        return packets.Packets(self.position, self.face) if packets.available() else None
-
-    def _alpha(self, **options: bool):
-        from jaxprt.visibility.alpha_packets import AlphaPackets
-
-        assert self.opacity is not None
-        return AlphaPackets(self.position, self.face, self.opacity, **options)
-
-    @cached_property
-    def _partial(self):
-        """The Embree scene for rays that pass holes and translucent surfaces."""
-        return self._alpha()
+        return self._packets()
 
     @cached_property
     def translucent(self):
-        """The triangles that are not opaque alone, as `jaxprt.visibility.alpha_packets.AlphaPackets`."""
-        return self._alpha(clear_only=True)
+        """The triangles that are not opaque alone, as `jaxprt.visibility.packets.Packets`."""
+        return self._packets(clear_only=True)
+
+    def _packets(self, **options: bool):
+        from jaxprt.visibility.packets import Packets  # numba takes half a second to import
+
+        return Packets(self.position, self.face, self.opacity, **options)
+
+    def packets(self) -> Any:
+        """The Embree scene for packets of rays, as `jaxprt.visibility.packets.Packets`."""
+        with self._building:
+            return self._packed
+
+    def _run(self, origin: np.ndarray, direction: np.ndarray, **options: Any) -> Any:
+        """Traces rays one at a time."""
+        with self._building:
+            single = self._single
+        return single.run(origin, direction, **options)
 
     @property
     def blends(self) -> bool:
@@ -92,17 +95,11 @@ class Occluder:
     def _twin(self) -> tuple[np.ndarray, np.ndarray]:
         """For each face, the coincident one of opposite orientation, or itself; and its corners in the face's order."""
         # Which of the two coincident faces a ray hits is arbitrary.
-        _, place = np.unique(self.position, axis=0, return_inverse=True)
-        at = place.reshape(-1)[self.face]
-        order = np.argsort(at, axis=1)
-        rows, inverse = np.unique(np.take_along_axis(at, order, 1), axis=0, return_inverse=True)
-        # Odd permutations of the sorted corners have one orientation, even permutations the other.
-        odd = (order[:, 0] > order[:, 1]) ^ (order[:, 0] > order[:, 2]) ^ (order[:, 1] > order[:, 2])
+        alike, odd, order = orientations(self.position, self.face)
         corner = np.take_along_axis(self.face, order, 1)
-        example = np.full((2, len(rows)), -1)
-        inverse = inverse.reshape(-1)
-        example[odd.astype(int), inverse] = np.arange(len(self.face))
-        other = example[1 - odd.astype(int), inverse]
+        example = np.full((2, len(self.face)), -1)
+        example[odd, alike] = np.arange(len(self.face))
+        other = example[1 - odd, alike]
         twin = np.where((other >= 0)[:, None], corner[other], corner)
         result = np.empty_like(self.face)
         np.put_along_axis(result, order, twin, 1)
@@ -117,36 +114,26 @@ class Occluder:
             triangle: Indices of the triangles.
             direction: Directions of the rays.
         """
-        return np.where(self._away(triangle, direction)[:, None], self._twin[1][triangle], self.face[triangle])
+        away = self.hits_back(triangle, direction)
+        return np.where(away[:, None], self._twin[1][triangle], self.face[triangle])
 
-    def toward(
-        self,
-        triangle: Integer[np.ndarray, " n"],
-        direction: Float32[np.ndarray, "n 3"],
-        barycentric: Float32[np.ndarray, "n 3"],
-    ) -> tuple[Integer[np.ndarray, " n"], Float32[np.ndarray, "n 3"]]:
-        """The triangles that rays hit and where. Of two coincident faces it takes the one that faces the ray.
-
-        Args:
-            triangle: Indices of the triangles.
-            direction: Directions of the rays.
-            barycentric: Barycentric coordinates of the hits.
-        """
-        away = np.flatnonzero(self._away(triangle, direction))
-        if not away.size:
-            return triangle, barycentric
-        partner, corner = (table[triangle[away]] for table in self._twin)
-        same = self.face[partner][:, :, None] == corner[:, None]
-        triangle, barycentric = triangle.copy(), barycentric.copy()
-        triangle[away], barycentric[away] = partner, np.einsum("nij,nj->ni", same, barycentric[away])
-        return triangle, barycentric
-
-    def _away(
+    def hits_back(
         self, triangle: Integer[np.ndarray, " n"], direction: Float32[np.ndarray, "n 3"]
     ) -> Bool[np.ndarray, " n"]:
         """Whether rays hit triangles from behind, by the order of their corners."""
         a, b, c = (self.position[self.face[triangle, corner]] for corner in range(3))
         return np.sum(np.cross(b - a, c - a) * direction, -1) > 0
+
+    def facing_hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"]):
+        """The result of `hit`. Of two coincident faces it takes the one that faces the ray."""
+        triangle, distance, weight = self.hit(origin, direction)
+        hit = np.flatnonzero(triangle >= 0)
+        away = hit[self.hits_back(triangle[hit], direction[hit])]
+        if away.size:
+            partner, corner = (table[triangle[away]] for table in self._twin)
+            same = self.face[partner][:, :, None] == corner[:, None]
+            triangle[away], weight[away] = partner, np.einsum("nij,nj->ni", same, weight[away])
+        return triangle, distance, weight
 
     def blocked(
         self,
@@ -166,13 +153,11 @@ class Occluder:
             point: Index of each ray's origin in `origin`.
             way: Index of each ray's direction in `direction`.
         """
-        with self._building:
-            packed = self._packed if self.opacity is None else self._partial
-        if packed is not None:
-            return packed.blocked(origin, direction, point, way)
-        with self._building:
-            single = self._single
-        return single.run(origin.take(point, axis=0), direction.take(way, axis=0), query="OCCLUDED") == 0
+        from jaxprt.visibility import embree
+
+        if self.opacity is None and embree.library() is None:
+            return self._run(origin.take(point, axis=0), direction.take(way, axis=0), query="OCCLUDED") == 0
+        return self.packets().blocked(origin, direction, point, way)
 
     def passed(
         self,
@@ -182,17 +167,7 @@ class Occluder:
         way: Integer[np.ndarray, " n"],
     ) -> Float32[np.ndarray, " n"]:
         """Share of light that passes along each ray, for an occluder that `blends`. `blocked` has the arguments."""
-        with self._building:
-            partial = self._partial
-        return partial.passed(origin, direction, point, way)
-
-    def from_pixels(self) -> Any:
-        """The Embree scene for rays from the points of pictures."""
-        with self._building:
-            packed = self._packed if self.opacity is None else self._partial
-        if packed is None:
-            raise RuntimeError("rays from pixels need embreex with Embree 4, which has packets of rays")
-        return packed
+        return self.packets().passed(origin, direction, point, way)
 
     def hit(self, origin: Float32[np.ndarray, "m 3"], direction: Float32[np.ndarray, "m 3"], *, solid: bool = False):
         """Index of the first triangle on each ray (-1 for none), its distance, and the barycentric coordinates.
@@ -204,12 +179,8 @@ class Occluder:
                 stop a ray with the probability of their opacity, by a hash of the ray.
         """
         if self.opacity is not None and not solid:
-            with self._building:
-                partial = self._partial
-            return partial.hit(np.ascontiguousarray(origin), np.ascontiguousarray(direction))
-        with self._building:
-            single = self._single
-        hit = single.run(origin, direction, query="INTERSECT", output=True)
+            return self.packets().hit(np.ascontiguousarray(origin), np.ascontiguousarray(direction))
+        hit = self._run(origin, direction, query="INTERSECT", output=True)
         u, v = hit["u"], hit["v"]
         return hit["primID"].astype(np.int64), hit["tfar"], np.stack([1 - u - v, u, v], -1)
 

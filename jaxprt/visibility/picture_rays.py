@@ -20,6 +20,7 @@ direct illumination and stochastic shadows", 2018). Where the first rays of sixt
 more are traced; in half-shadows, four times as many.
 """
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -32,11 +33,10 @@ from jaxprt.visibility.occluder import Occluder, offsets
 
 FULL = 255  # share of a texel that is visible completely
 PLACES = 64  # places in each texel
-_PIECE = 1 << 12  # points that a thread traces at a time
+_PIECE = 1 << 11  # points that a thread traces at a time
 _BAYER = np.array([[0, 2], [3, 1]])
 for _ in range(2):
     _BAYER = np.block([[4 * _BAYER, 4 * _BAYER + 2], [4 * _BAYER + 3, 4 * _BAYER + 1]])
-_PART = 1 << 10  # points that a thread traces at a time
 
 
 class PicturePoints(NamedTuple):
@@ -80,37 +80,33 @@ def shares(mesh: Mesh, occluder: Occluder, points: PicturePoints, rays: TexelRay
         points: The points.
         rays: Rays to the texels.
     """
-    from jaxprt.visibility import packets  # numba takes half a second to import
+    from jaxprt.visibility.picture_loops import trace_shares  # numba takes half a second to import
 
-    position = np.asarray(mesh.position, np.float32)
-    face = np.ascontiguousarray(mesh.face, np.int32)
-    surface = position, np.asarray(mesh.normal, np.float32), face, offsets(position, face)
-    drawn = *point_fields(points), dither_pattern(points)
-    middle = rays.direction.mean(1)
     # Texels start at different places, so that their dither patterns do not add up.
     first = (np.arange(len(rays.per_texel)) * 37) % PLACES
-    texels = rays.direction, middle, np.asarray(rays.per_texel, np.int64), first
+    texels = rays.direction, rays.direction.mean(1), np.asarray(rays.per_texel, np.int64), first
     share = np.empty((len(rays.per_texel), len(points.triangle)), np.uint8)
-    parts = [slice(i, min(i + _PIECE, share.shape[1])) for i in range(0, share.shape[1], _PIECE)]
-    packed = occluder.from_pixels()
-
-    def trace(part: slice) -> None:
-        packets.trace_shares(packed.query, surface, drawn, texels, part.start, part.stop, share)
-
-    with ThreadPoolExecutor(blocks.cores()) as pool:
-        list(pool.map(trace, parts))
+    _trace(trace_shares, mesh, occluder, points, texels, share)
     return share
 
 
-def point_fields(points: PicturePoints) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles, barycentric coordinates and slopes of points, as the loops over packets take them."""
+def _trace(
+    loop: Callable, mesh: Mesh, occluder: Occluder, points: PicturePoints, *arguments: tuple | np.ndarray
+) -> None:
+    """Runs a loop of `jaxprt.visibility.picture_loops` over all points, on every processor."""
+    position, face = np.asarray(mesh.position, np.float32), np.ascontiguousarray(mesh.face, np.int32)
+    surface = position, np.asarray(mesh.normal, np.float32), face, offsets(position, face)
     barycentric, slope = (np.ascontiguousarray(value, np.float32) for value in points[1:3])
-    return np.ascontiguousarray(points.triangle, np.int64), barycentric, slope
+    pattern = _BAYER[points.row % 8, points.column % 8]
+    drawn = np.ascontiguousarray(points.triangle, np.int64), barycentric, slope, pattern
+    packets, count = occluder.packets(), len(barycentric)
 
+    def trace(first: int) -> None:
+        query = packets.query(share=np.empty(16, np.float32))
+        loop(query, surface, drawn, first, min(first + _PIECE, count), *arguments)
 
-def dither_pattern(points: PicturePoints) -> Int[np.ndarray, " p"]:
-    """Number in the dither pattern of each point's pixel, from 0 to 63."""
-    return _BAYER[points.row % 8, points.column % 8]
+    with ThreadPoolExecutor(blocks.cores()) as pool:
+        list(pool.map(trace, range(0, count, _PIECE)))
 
 
 class LampPlaces(NamedTuple):
@@ -157,19 +153,10 @@ def moments(
         normal: Their shading normals.
         lamps: Places on the lamps.
     """
-    from jaxprt.visibility import packets  # numba takes half a second to import
+    from jaxprt.visibility.picture_loops import trace_lamps  # numba takes half a second to import
 
-    surface = occluder.position, np.asarray(mesh.normal, np.float32), occluder.face, occluder.offset
-    drawn = *point_fields(points), dither_pattern(points)
     fields = tuple(np.ascontiguousarray(vector, np.float32) for vector in (position, normal))
     size = int(lamps.pieces.sum()), len(position)
     result = np.empty(size, np.float32), np.empty(size, np.float32), np.empty((size[0], 3, size[1]), np.float32)
-    parts = [slice(i, min(i + _PART, len(position))) for i in range(0, len(position), _PART)]
-    packed = occluder.from_pixels()
-
-    def trace(part: slice) -> None:
-        packets.trace_lamps(packed.query, surface, drawn, fields, tuple(lamps), part.start, part.stop, result)
-
-    with ThreadPoolExecutor(blocks.cores()) as pool:
-        list(pool.map(trace, parts))
+    _trace(trace_lamps, mesh, occluder, points, fields, tuple(lamps), result)
     return result

@@ -118,9 +118,8 @@ def fractional(
 
     Reference: Wang, Tran, Luebke 2004, section 3.3 (there all texels at 6 x 256 x 256).
     """
-    table = _tables(size)
-    seen = np.zeros((len(start), 6 * size * size), np.uint8)
-    above = normal.astype(np.float32) @ table.area.T > 0
+    table, above = _tables(size), _above_horizon(normal, size)
+    seen = np.zeros(above.shape, np.uint8)
     step = max(1, _RAYS // (3 * size * size))
     count = RayCount(0, 0, 0)
     for first in range(0, len(start), step):
@@ -134,9 +133,8 @@ def exhaustive(
     occluder: Occluder, start: Float32[np.ndarray, "v 3"], normal: Float32[np.ndarray, "v 3"], *, size: int
 ) -> UInt8[np.ndarray, "v d"]:
     """The result of `fractional`, but with 16 rays in every texel above the horizon: a slow reference for tests."""
-    table = _tables(size)
-    seen = np.zeros((len(start), 6 * size * size), np.uint8)
-    above = normal.astype(np.float32) @ table.area.T > 0
+    table, above = _tables(size), _above_horizon(normal, size)
+    seen = np.zeros(above.shape, np.uint8)
     for vertex in range(len(start)):
         texel = np.flatnonzero(above[vertex])
         seen[vertex, texel] = _supersample(occluder, start, np.full(texel.size, vertex), texel, table)
@@ -304,22 +302,18 @@ def _trace(
     """Fills `seen` for some of the points."""
     vertex, rank = np.nonzero(above.take(table.order, axis=1))
     texel = table.order.take(rank)
-    flat = seen.reshape(-1)
-    place = vertex * above.shape[1] + texel
-    if occluder.blends:
-        share = occluder.passed(start, table.center, vertex, texel)
-        flat[place] = _dither(LEVELS * share, vertex, texel)
-        boundary = _varying_texels
-    else:
-        flat[place] = ~occluder.blocked(start, table.center, vertex, texel)
-        boundary = _boundary
-    mixed = place[:0]
+    flat, index = seen.reshape(-1), vertex * above.shape[1] + texel
+    flat[index] = _dither(LEVELS * _shares(occluder, start, table.center, vertex, texel), vertex, texel)
+    mixed = index[:0]
     if supersample is not False:
-        mixed = np.flatnonzero((boundary(seen, table.border).reshape(seen.shape) & supersample).reshape(-1)[place])
-    if not occluder.blends:
-        flat[place] *= LEVELS
-    flat[place[mixed]] = _supersample(occluder, start, vertex[mixed], texel[mixed], table)
-    return RayCount(len(place) + LEVELS * len(mixed), len(place), len(mixed))
+        mixed = np.flatnonzero((_varies(seen, table.border) & supersample).reshape(-1)[index])
+        flat[index[mixed]] = _supersample(occluder, start, vertex[mixed], texel[mixed], table)
+    return RayCount(len(index) + LEVELS * len(mixed), len(index), len(mixed))
+
+
+def _above_horizon(normal: Float32[np.ndarray, "v 3"], size: int) -> Bool[np.ndarray, "v d"]:
+    """Texels whose integral of the cosine is positive."""
+    return normal.astype(np.float32) @ _tables(size).area.T > 0
 
 
 def _finer(
@@ -328,50 +322,42 @@ def _finer(
     """Visibility of the texels inside of larger ones; 0 below the horizon."""
     edge = math.isqrt(coarse.shape[1] // 6)
     wide = coarse.reshape(-1, 6, edge, edge).repeat(size // edge, 2).repeat(size // edge, 3)
-    return wide.reshape(len(coarse), -1) * (normal.astype(np.float32) @ _tables(size).area.T > 0)
+    return wide.reshape(len(coarse), -1) * _above_horizon(normal, size)
 
 
-def _boundary(clear: np.ndarray, border: np.ndarray) -> np.ndarray:
-    """Texels whose 3 x 3 neighborhood has visible and blocked texels; texels below the horizon count as blocked."""
-    padded = clear.take(border.reshape(-1), axis=1).reshape(-1, *border.shape)
-    return (_dilate(padded) & _dilate(1 - padded)).astype(bool)
+def _shares(occluder: Occluder, *rays: np.ndarray) -> UInt8[np.ndarray, " n"] | Float32[np.ndarray, " n"]:
+    """Share of light that passes along each ray; whole numbers for an occluder that does not blend."""
+    return occluder.passed(*rays) if occluder.blends else (~occluder.blocked(*rays)).view(np.uint8)
 
 
 def _dither(value: np.ndarray, vertex: np.ndarray, texel: np.ndarray) -> np.ndarray:
     """Whole numbers whose mean over neighboring texels is that of the values, by ordered dithering."""
     # Rounding to the nearest would change the share that all texels behind a translucent surface have, by up to 1/32.
-    return np.floor(value + (_KRONECKER[0] * texel + _KRONECKER[1] * vertex) % 1)
+    exact = value.dtype == np.uint8
+    return value if exact else np.floor(value + (_KRONECKER[0] * texel + _KRONECKER[1] * vertex) % 1)
 
 
-def _varying_texels(seen: np.ndarray, border: np.ndarray) -> np.ndarray:
+def _varies(seen: UInt8[np.ndarray, "v d"], border: np.ndarray) -> Bool[np.ndarray, "v d"]:
     """Texels in whose 3 x 3 neighborhood visibility, in sixteenths, differs by more than an eighth."""
     padded = seen.take(border.reshape(-1), axis=1).reshape(-1, *border.shape)
-    rows = [(padded[..., :-2, :], padded[..., 1:-1, :], padded[..., 2:, :]) for _ in range(2)]
-    high, low = (op.reduce(row) for op, row in zip((np.maximum, np.minimum), rows, strict=True))
-    high = np.maximum.reduce((high[..., :-2], high[..., 1:-1], high[..., 2:]))
-    low = np.minimum.reduce((low[..., :-2], low[..., 1:-1], low[..., 2:]))
-    return high - low > LEVELS // 8
+    return (_around(np.maximum, padded) - _around(np.minimum, padded) > LEVELS // 8).reshape(seen.shape)
 
 
-def _dilate(padded: np.ndarray) -> np.ndarray:
-    """Maximum over 3 x 3 neighborhoods of binary images with a border of one texel."""
-    rows = padded[..., :-2, :] | padded[..., 1:-1, :] | padded[..., 2:, :]
-    return rows[..., :-2] | rows[..., 1:-1] | rows[..., 2:]
+def _around(extreme: np.ufunc, padded: np.ndarray) -> np.ndarray:
+    """Maximum or minimum over 3 x 3 neighborhoods of images with a border of one texel."""
+    rows = extreme(extreme(padded[..., :-2, :], padded[..., 1:-1, :]), padded[..., 2:, :])
+    return extreme(extreme(rows[..., :-2], rows[..., 1:-1]), rows[..., 2:])
 
 
 def _supersample(occluder, start, vertex, texel, table) -> np.ndarray:
-    """Number of unblocked rays out of 16 for each (vertex, texel) pair; of translucent surfaces the shares count."""
+    """Visible sixteenths of texels, from 16 rays for each (vertex, texel) pair."""
     out = np.empty(len(vertex), np.uint8)
     step = _RAYS // LEVELS
     for first in range(0, len(vertex), step):
         part = slice(first, first + step)
         way = (LEVELS * texel[part, None] + np.arange(LEVELS)).reshape(-1)
-        if occluder.blends:
-            share = occluder.passed(start, table.fine, np.repeat(vertex[part], LEVELS), way).reshape(-1, LEVELS)
-            out[part] = _dither(share.sum(1), vertex[part], texel[part])
-            continue
-        shadow = occluder.blocked(start, table.fine, np.repeat(vertex[part], LEVELS), way)
-        out[part] = LEVELS - shadow.reshape(-1, LEVELS).sum(1, dtype=np.uint8)
+        share = _shares(occluder, start, table.fine, np.repeat(vertex[part], LEVELS), way).reshape(-1, LEVELS)
+        out[part] = _dither(share.sum(1, dtype=share.dtype), vertex[part], texel[part])
     return out
 
 
@@ -390,9 +376,8 @@ def hemisphere_hits(
         For each hit the index of the point, the index of the texel, the vertices of the triangle and its barycentric
         coordinates; and the total number of rays.
     """
-    area = np.asarray(cubemap.vector_area(size=size), np.float32).reshape(-1, 3)
-    direction = np.asarray(cubemap.direction(size=size), np.float32).reshape(-1, 3)
-    point, texel = np.nonzero(normal @ area.T > 0)
+    direction = _tables(size).center
+    point, texel = np.nonzero(normal @ _tables(size).area.T > 0)
     triangle, _, barycentric = occluder.hit(start[point], direction[texel])
     hit = np.flatnonzero(triangle >= 0)
     corner = occluder.facing(triangle[hit], direction[texel[hit]])
@@ -431,9 +416,8 @@ def first_fronts(
         start: Origins of the rays.
         direction: Unit directions.
     """
-    triangle, _, barycentric = occluder.hit(start, direction)
+    triangle, _, barycentric = occluder.facing_hit(start, direction)
     hit = np.flatnonzero(triangle >= 0)
-    triangle[hit], barycentric[hit] = occluder.toward(triangle[hit], direction[hit], barycentric[hit])
     triangle[hit[~hits_front(occluder, normal, occluder.face[triangle[hit]], direction[hit])]] = -1
     weight = np.clip(barycentric, 0, 1)
     return triangle, weight / np.maximum(weight.sum(1, keepdims=True), 1e-6)

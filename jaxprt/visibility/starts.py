@@ -4,11 +4,8 @@ Such a vertex sees nothing, and no picture shows it. But visibility is interpola
 them outside of the solid would turn black towards it. It gets the visibility of the nearest place outside instead.
 """
 
-from typing import Any
-
-import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32
 
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.points import Points
@@ -65,20 +62,6 @@ def out_of_solids(
     return result, buried
 
 
-def _normals(occluder: Occluder) -> Float32[np.ndarray, "f 3"]:
-    """Normals of triangles by their winding, not of unit length."""
-    a, b, c = (occluder.position[occluder.face[:, corner]] for corner in range(3))
-    return np.cross(b - a, c - a)
-
-
-def _first_front(occluder: Occluder, start: np.ndarray, way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The first triangle on each ray, -1 for none, and its distance. Of the two sides of a sheet no ray hits a back."""
-    triangle, distance, weight = occluder.hit(start, way)
-    hit = np.flatnonzero(triangle >= 0)
-    triangle[hit] = occluder.toward(triangle[hit], way[hit], weight[hit])[0]
-    return triangle, distance
-
-
 def inside(
     occluder: Occluder, start: Float32[np.ndarray, "n 3"], out: Float32[np.ndarray, "n 3"]
 ) -> Bool[np.ndarray, " n"]:
@@ -89,7 +72,6 @@ def inside(
         start: Ray origins.
         out: Unit vectors off the surface. Most points are told by the first ray, which is near this vector.
     """
-    facing = _normals(occluder)
     number = np.arange(_RAYS) + 0.5
     height = 1 - number / _RAYS
     angle = np.pi * (3 - np.sqrt(5)) * number
@@ -101,9 +83,9 @@ def inside(
     other = np.cross(out, side)
     for x, y, z in local:
         way = x * side[hidden] + y * other[hidden] + z * out[hidden]
-        triangle, distance = _first_front(occluder, start[hidden], way)
-        back = np.sum(facing[triangle] * way, 1) > 0
-        behind[hidden] += back & (triangle >= 0)
+        # Of the two sides of a sheet no ray hits a back.
+        triangle, distance, _ = occluder.facing_hit(start[hidden], way)
+        behind[hidden] += occluder.hits_back(triangle, way) & (triangle >= 0)
         if z > _STEEP:
             covered[hidden] &= distance * z < _CLOSE * occluder.diagonal
         hidden = hidden[triangle >= 0]
@@ -138,7 +120,7 @@ def _outside(
     reached = np.full(len(origin), np.inf, np.float32)
     active = np.flatnonzero(length > 4 * offset)
     for _ in range(_CROSSINGS):
-        triangle, distance = _first_front(occluder, place[active], way[active])
+        triangle, distance, _ = occluder.facing_hit(place[active], way[active])
         step = distance + 2 * offset[active]
         on_way = (triangle >= 0) & (travelled[active] + step < length[active])
         active, step = active[on_way], step[on_way]
@@ -326,37 +308,6 @@ def _off_contact(
     return result
 
 
-class PointVisibility(eqx.Module):
-    """Visibility of single texels at surface points, interpolated from the vertices of their triangles.
-
-    Attributes:
-        vertices: Visibility of the vertices.
-        points: The surface points.
-    """
-
-    vertices: Any
-    points: Points
-
-    @property
-    def position(self) -> Float[Array, "p 3"]:
-        """Positions in world units."""
-        return self.points.carry(self.vertices.position)
-
-    @property
-    def frame(self) -> Float[Array, "p 3 3"]:
-        """Rows are tangent, bitangent, normal."""
-        return self.points.frame(self.vertices.frame)
-
-    @property
-    def size(self) -> int:
-        """Edge of the cubemap's faces in texels."""
-        return self.vertices.size
-
-    def visible(self, texel: Int[Array, " t"]) -> Float[Array, "t p"]:
-        """Visible fraction of some texels, from 0 to 1."""
-        return self.points.carry(self.vertices.visible(texel), axis=1)
-
-
 def point_starts(mesh: Mesh, points: Points) -> Float32[np.ndarray, "p 3"]:
     """Origins of rays from surface points, off the triangle by what rounding needs, on the side of the shading normal.
 
@@ -371,12 +322,10 @@ def point_starts(mesh: Mesh, points: Points) -> Float32[np.ndarray, "p 3"]:
         raise ValueError(f"points must have three corners, got {len(points.corner)}")
     corner = np.asarray(points.corner)
     position = np.asarray(mesh.position, np.float32)
-    a, b, c = position[corner].astype(np.float64)
     normal = np.asarray(points.carry(mesh.normal), np.float64)
-    facing = np.cross(b - a, c - a)
-    length = np.linalg.norm(facing, axis=1, keepdims=True)
-    facing = np.where(length > 0, facing / np.where(length > 0, length, 1), normal)
+    facing = _face_normal(position, corner.T)
+    facing = np.where(facing.any(1, keepdims=True), facing, normal)
     side = np.where(np.sum(facing * normal, 1, keepdims=True) < 0, -1.0, 1.0)
     weight = np.asarray(points.weight, np.float64)  # a rounded sum would move points out of the plane
-    place = np.einsum("kp,kpi->pi", weight / weight.sum(0), np.stack([a, b, c]))
+    place = np.einsum("kp,kpi->pi", weight / weight.sum(0), position[corner].astype(np.float64))
     return (place + offsets(position, corner.T)[:, None] * side * facing).astype(np.float32)

@@ -34,7 +34,7 @@ UNSAVED = {"jaxprt.cli.report", "jaxprt.cli.animation", "jaxprt.__main__", "jaxp
 UNSAVED |= {
     f"jaxprt.scene.formats.{name}" for name in ("geometry", "gltf_file", "gltf_geometry", "gltf_nodes", "ply", "text")
 }
-UNSAVED |= {"jaxprt.visibility.packets", "jaxprt.relit.exact_lamps"}
+UNSAVED |= {"jaxprt.visibility.embree", "jaxprt.relit.exact_lamps"}
 SEEDS = 300
 
 

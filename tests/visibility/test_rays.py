@@ -388,7 +388,7 @@ def test_no_rays_meet_nothing():
 
 def test_without_packets_visibility_is_the_same(monkeypatch):
     expected = trace(torus())
-    monkeypatch.setattr("jaxprt.visibility.packets.available", lambda: False)
+    monkeypatch.setattr("jaxprt.visibility.embree.library", lambda: None)
     np.testing.assert_array_equal(trace(torus()), expected)
 
 

@@ -1,19 +1,22 @@
 """Rays from several threads change no memory of others, and give the bits of one thread, on each instruction set."""
 
 import ctypes
+import re
 import sys
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 
+import embreex
 import numpy as np
 import pytest
 
 from jaxprt import visibility
 from jaxprt.scene import Part, Scene, TexturedMaterial
 from jaxprt.scene.mesh import make_mesh
-from jaxprt.visibility import Occluder, blocks, packets, picture_rays, rays
+from jaxprt.visibility import Occluder, blocks, embree, picture_rays, rays
 from jaxprt.visibility.picture_rays import LampPlaces, PicturePoints, TexelRays
 
 COUNT = 4000  # rays of each path
@@ -71,18 +74,18 @@ def tracers() -> dict[str, Callable[[], bytes]]:
     }
 
 
-def embree(config: str, width: int | None = None) -> packets.Embree:
+def library(config: str, width: int | None = None) -> embree.Embree:
     """The library with a device for an instruction set, and with packets of a width that it may not trace as such."""
-    library = packets.library()
-    assert library is not None
-    found = packets.Embree.on(library.functions, config.encode())
+    own = embree.library()
+    assert own is not None
+    found = embree.Embree.on(own.functions, config.encode())
     if found is None:
         pytest.skip(f"this processor has not what {config} asks for")
     if width is None:
         return found
     named = {"occluded": f"rtcOccluded{width}", "intersect": f"rtcIntersect{width}"}
     query = {
-        field: (ctypes.cast(getattr(library.functions, name), ctypes.c_void_p).value, width)
+        field: (ctypes.cast(getattr(own.functions, name), ctypes.c_void_p).value, width)
         for field, name in named.items()
     }
     return found._replace(**query)
@@ -128,8 +131,8 @@ def undone_writes(trace: Callable[[], bytes], seconds: float) -> int:
 def test_tracing_undoes_no_writes_of_another_thread(packet, monkeypatch):
     monkeypatch.setattr(picture_rays, "ThreadPoolExecutor", Inline)
     if packet == "ray by ray":  # what Embree does where 16 rays are no packet of the processor
-        other = embree("isa=avx2", 16)
-        monkeypatch.setattr(packets, "library", lambda: other)
+        other = library("isa=avx2", 16)
+        monkeypatch.setattr(embree, "library", lambda: other)
     interval = sys.getswitchinterval()
     try:
         sys.setswitchinterval(1e-4)
@@ -140,10 +143,19 @@ def test_tracing_undoes_no_writes_of_another_thread(packet, monkeypatch):
 
 
 def test_memory_for_rays_holds_all_that_embree_writes():
-    ray, valid, packet = packets.ray_buffers()
+    ray, valid, packet = embree.ray_buffers()
     assert packet.nbytes >= 16 * 21 * 4 + 16 * 4  # RTCRayHit16 and which rays are valid
     assert ray.nbytes >= 16 * 21 * 4
     assert all(array.ctypes.data % 64 == 0 for array in (ray, valid, packet))
+
+
+def test_rows_of_rays_are_those_of_the_declarations_that_embreex_ships():
+    text = (Path(embreex.__file__).parent / "rtcore_ray.pxd").read_text()
+    order = re.findall(r"(?:float|unsigned int) (\w+)", text)  # RTCRay, then RTCHit
+    names = ["org_x", "dir_x", "tfar", "mask", "id", "Ng_x", "u", "v", "primID", "geomID"]
+    rows = [embree.ORIGIN, embree.DIRECTION, embree.FAR, embree.MASK, embree.ID]
+    rows += [embree.NORMAL, embree.U, embree.V, embree.PRIMITIVE, embree.GEOMETRY]
+    assert [order.index(name) for name in names] == rows
 
 
 def run_beside(trace: dict[str, Callable[[], bytes]], threads: int, seconds: float) -> list[dict[str, bytes]]:
@@ -195,8 +207,8 @@ def test_stored_visibility_does_not_depend_on_the_number_of_threads(monkeypatch)
 @pytest.mark.parametrize("name", SETS)
 def test_instruction_sets_see_the_same(name, monkeypatch):
     alone = {name: function() for name, function in tracers().items()}
-    other = embree(f"isa={name}")
-    monkeypatch.setattr(packets, "library", lambda: other)
+    other = library(f"isa={name}")
+    monkeypatch.setattr(embree, "library", lambda: other)
     found = {name: function() for name, function in tracers().items()}
     for path, kind in {"blocked": np.uint8, "visibility": np.uint8, "shares": np.uint8, "passed": np.float32}.items():
         other, own = (np.frombuffer(side[path], kind) for side in (found, alone))
