@@ -87,8 +87,8 @@ def command(
                 for key, value in (member if isinstance(member, dict) else {"": member}).items()
             ]
         text, _, _ = (inspect.getdoc(function) or "").partition("\n\nOptions:\n")
-        every = [*arguments, *itertools.chain(*members.values())]
-        result = Command(name, callback=run, params=every, help=text, short_help=short_help)
+        parameters = [*arguments, *itertools.chain(*members.values())]
+        result = Command(name, callback=run, params=parameters, help=text, short_help=short_help)
         result.groups = members
         return result
 
