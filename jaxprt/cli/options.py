@@ -1,5 +1,6 @@
 """Options of commands, with the names, defaults and docstrings of the functions that the commands call; and results."""
 
+import collections
 import contextlib
 import dataclasses
 import inspect
@@ -82,7 +83,7 @@ def command(
         words, members = described(function), {}
         for title, group in groups.items():
             members[title] = [
-                option(key, words.get(key, ""), *value) if key else value
+                option(key, words[key], *value) if key else value
                 for member in group
                 for key, value in (member if isinstance(member, dict) else {"": member}).items()
             ]
@@ -114,10 +115,11 @@ def option(name: str, words: str, kind: Any = None, default: Any = None) -> clic
     return click.Option(names, type=kind, default=default, help=words, **more)
 
 
-def described(documented: Any) -> dict[str, str]:
+def described(documented: Any) -> collections.defaultdict[str, str]:
     """The first sentence of a docstring on each argument or attribute, with what it says of None as the default."""
+    # `python -OO` leaves docstrings out.
     entries = re.findall(r"^    (\w+): (.*(?:\n        .*)*)", inspect.getdoc(documented) or "", re.MULTILINE)
-    result = {}
+    result = collections.defaultdict(str)
     for name, text in entries:
         sentences = re.split(r"(?<=\.) +(?=[A-Z])", " ".join(text.split()))
         defaults = [sentence[len("If None, ") : -1] for sentence in sentences if sentence.startswith("If None, ")]
@@ -128,7 +130,7 @@ def described(documented: Any) -> dict[str, str]:
 def options_of(function: Callable, **kinds: Any) -> list[click.Option]:
     """Options for parameters of a function, by the types of their values; all else is the function's."""
     words, known = described(function), inspect.signature(function).parameters
-    return [option(name, words.get(name, ""), kind, known[name].default) for name, kind in kinds.items()]
+    return [option(name, words[name], kind, known[name].default) for name, kind in kinds.items()]
 
 
 class Range(click.ParamType):

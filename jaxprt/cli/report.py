@@ -212,7 +212,7 @@ def write_layers(view: View, system: str, scene: RelitScene, layers: Sequence[st
 
 def _write(path: Path, picture: Array | np.ndarray, stops: Array, *, gain: float = 1.0, tone: str = "srgb") -> None:
     files.write_exr(path.with_name(f"{path.name}.exr"), np.asarray(picture))
-    shown = image.display(picture * gain, tone=tone, stops=stops)
+    shown = image.display(jnp.asarray(picture) * gain, tone=tone, stops=stops)
     files.write_png(path.with_name(f"{path.name}.png"), np.asarray(shown))
 
 
