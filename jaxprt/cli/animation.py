@@ -7,15 +7,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import tqdm
-from jaxtyping import Array
 
 from jaxprt import files, image
 from jaxprt.brdf import BlinnPhong, CookTorrance
 from jaxprt.cli.inputs import about
 from jaxprt.cli.report import View
 from jaxprt.relit import RelitScene
-from jaxprt.relit.channels import Shading, roughness_range
-from jaxprt.scene import Camera, Part, TexturedMaterial
+from jaxprt.relit.channels import Changeable, Shading, roughness_range
+from jaxprt.scene import Camera
 from jaxprt.scene.environment import rotate
 from jaxprt.systems import standard
 
@@ -37,7 +36,7 @@ def animate(scene: RelitScene, view: View, folder: Path, *, frames: int, progres
         camera = _swung(view.camera, _ORBIT * np.sin(2 * np.pi * turn))
         picture = scene.picture(rotate(light, about(2 * np.pi * turn)), camera, materials=materials(scene, turn=turn))
         if stops is None:
-            stops = image.automatic_exposure(picture, coverage=scene.coverage(camera))
+            stops = scene.exposure(picture, camera)
         result.append(folder / f"frame_{number:04d}.png")
         files.write_png(result[-1], np.asarray(image.display(picture, tone=view.tone, stops=stops)))
     return result
@@ -45,17 +44,17 @@ def animate(scene: RelitScene, view: View, folder: Path, *, frames: int, progres
 
 def materials(scene: RelitScene, *, turn: float) -> dict[str, Any]:
     """Materials of the parts that can change. As `turn` goes from 0 to 1, they cycle through roughnesses and colors."""
-    pairs = enumerate(zip(scene.scene.parts, scene.shading, strict=True))
+    parts = enumerate(zip(scene.scene.parts, scene.shading, strict=True))
+    away = float(np.sin(np.pi * turn) ** 2)
     return {
-        part.name: _moved(part, shading, number / 3, float(np.sin(np.pi * turn) ** 2))
-        for number, (part, shading) in pairs
-        if shading.blend is not None and isinstance(part.material, TexturedMaterial | BlinnPhong | CookTorrance)
+        part.name: _moved(part.material, shading, number / 3, away)
+        for number, (part, shading) in parts
+        if shading.blend is not None and isinstance(part.material, Changeable)
     }
 
 
-def _moved(part: Part, shading: Shading, hue: float, away: float) -> Any:
-    """The material of a part, with another roughness and color; `away` is 0 for its own and 1 for the farthest."""
-    material = part.material
+def _moved(material: Changeable, shading: Shading, hue: float, away: float) -> Changeable:
+    """A material with another roughness and color; `away` is 0 for its own and 1 for the farthest."""
     rainbow = 1 + away * np.cos(2 * np.pi * (hue + np.arange(3) / 3))
     tint = jnp.asarray(rainbow / rainbow.max(), jnp.result_type(float))
     if isinstance(material, BlinnPhong):
@@ -63,14 +62,12 @@ def _moved(part: Part, shading: Shading, hue: float, away: float) -> Any:
         slope = _away(float(2 / (material.exponent + 2)) ** 0.5, away, low, 1.0)
         return dataclasses.replace(material, diffuse=material.diffuse * tint, exponent=jnp.asarray(2 / slope**2 - 2))
     if isinstance(material, CookTorrance):
-        low, high = np.exp(standard.COOK_TORRANCE.range)
-        slope = jnp.asarray(_away(float(material.roughness), away, low, high))
-        return dataclasses.replace(material, diffuse=material.diffuse * tint, roughness=slope)
-    assert isinstance(material, TexturedMaterial)
-    changed: dict[str, Array] = {"base_color": material.base_color * tint}
-    if not shading.matte:
-        low, high = roughness_range(shading)
-        changed["roughness"] = jnp.asarray(_away(float(material.roughness), away, low, high))
+        changed, limits = {"diffuse": material.diffuse * tint}, np.exp(standard.COOK_TORRANCE.range)
+    else:
+        changed = {"base_color": material.base_color * tint}
+        limits = None if shading.matte else roughness_range(shading)
+    if limits is not None:
+        changed["roughness"] = jnp.asarray(_away(float(material.roughness), away, *limits))
     return dataclasses.replace(material, **changed)
 
 
@@ -85,4 +82,4 @@ def _away(roughness: float, away: float, low: float, high: float) -> float:
 def _swung(camera: Camera, angle: float) -> Camera:
     """A camera that is rotated around its target, about the vertical."""
     offset = jnp.matmul(about(angle), camera.eye - camera.target, precision="highest")
-    return Camera(camera.target + offset, camera.target, camera.up, camera.field_of_view, camera.width, camera.height)
+    return dataclasses.replace(camera, eye=camera.target + offset)

@@ -4,6 +4,7 @@ import dataclasses
 import glob
 import importlib.metadata
 import io
+import itertools
 import json
 import math
 import sys
@@ -11,7 +12,7 @@ import tarfile
 import time
 import traceback
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,12 +23,12 @@ import numpy as np
 import tqdm
 
 from jaxprt import files, image
-from jaxprt.cli import inputs, options, relight
-from jaxprt.cli.options import option
+from jaxprt.cli import inputs, options
 from jaxprt.files import outputs
 from jaxprt.relit import RelitScene
 from jaxprt.relit.build import precompute
 from jaxprt.relit.exact import exact_pixels
+from jaxprt.relit.recipes import Recipe
 from jaxprt.scene import Camera, Environment, Scene
 from jaxprt.scene.camera import orbit
 from jaxprt.scene.formats import nerf
@@ -37,83 +38,36 @@ _SETTINGS, _FRAMES, _MANIFEST, _SCENE = "dataset.json", "transforms.json", "mani
 _PIXELS = 200  # pixels at which the error of pictures under each light is measured
 _EXPOSED = 4  # most views that the exposure is found from
 _GOLDEN = math.pi * (3 - math.sqrt(5))  # angle between successive cameras about the vertical
-_LOBES = 8  # whose tables are shipped
 _MEMORY = 1 << 28  # bytes of pictures that are held at once
 
 
-@click.command(cls=options.Command, short_help="Render pictures of many scenes under many lights, for training.")
-@options.scene
-@options.light_size
-@option(
-    "--lights",
-    group="Light",
-    multiple=True,
-    metavar="PATTERN",
-    help='More environments: a pattern such as "maps/*.hdr". May be given several times.',
+@options.command(
+    "dataset",
+    "Render pictures of many scenes under many lights, for training.",
+    options.FILES,
+    Scene=options.SCENE,
+    Light=[
+        *options.LIGHT_SIZE,
+        {"lights": (str, ()), "random_turns": (options.Range(0), 1)},
+    ],
+    Camera=[
+        {
+            "views": (options.Range(1, 100_000), 64),
+            "elevations": (options.Several(options.ELEVATION), (-10.0, 80.0)),
+            "cameras": (click.Path(exists=True, dir_okay=False, path_type=Path),),
+            "size": (options.PIXELS, 512),
+        }
+    ],
+    System=[options.systems(("lobe", "harmonic", "separable", "dynamic"), "One system."), options.NO_BOUNCES],
+    Sizes=options.sizes(lobes=options.SHIPPED_LOBES),
+    Output=[
+        {"seed": (options.Range(0), 0), "format": (click.Choice(["exr", "png"]), "exr"), "shards": (bool,)},
+        options.layers("Layers of EXR files.  [default: color,alpha]"),
+        options.folder("Folder for the pictures.", default="dataset"),
+        options.JSON,
+    ],
 )
-@option(
-    "--random-turns",
-    group="Light",
-    type=options.Whole(0),
-    default=1,
-    show_default=True,
-    metavar="N",
-    help="Rotate each light of each scene by N random angles about the vertical; 0 leaves lights as they are.",
-)
-@option(
-    "--views",
-    group="Camera",
-    type=options.Whole(1, 100_000),
-    default=64,
-    show_default=True,
-    help="Cameras on a sphere around each scene.",
-)
-@option(
-    "--elevations",
-    group="Camera",
-    type=options.Several(options.Finite(-90.0, 90.0)),
-    default="-10,80",
-    metavar="LOW,HIGH",
-    help="Lowest and highest elevation of these cameras in degrees.  [default: -10,80]",
-)
-@option(
-    "--cameras",
-    group="Camera",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    metavar="FILE",
-    help="Cameras of a transforms.json of NeRF or Blender, in place of --views.",
-)
-@option(
-    "--size", group="Camera", type=options.Whole(1, 8192), default=512, show_default=True, help="Pixels of an edge."
-)
-@option(
-    "--seed", group="Output", type=options.Whole(0), default=0, show_default=True, help="Seed of all random choices."
-)
-@option(
-    "--format",
-    "form",
-    group="Output",
-    type=click.Choice(["exr", "png"]),
-    default="exr",
-    show_default=True,
-    help="Linear EXR files with layers, or PNG files with alpha at the exposure of each scene and light.",
-)
-@option(
-    "--layers",
-    group="Output",
-    type=options.Several(click.Choice(list(outputs.LAYERS))),
-    default=None,
-    help="Layers of EXR files.  [default: color,alpha]",
-)
-@option(
-    "--shards", group="Output", is_flag=True, help="Pack the pictures of each scene into a tar file for WebDataset."
-)
-@options.systems(("lobe", "harmonic", "separable", "dynamic"), default="lobe", words="One system.  [default: lobe]")
-@options.no_bounces
-@options.recipe
-@options.folder("Folder for the pictures.", default="dataset")
-@options.as_json
-def command(**arguments: Any) -> None:
+def command(chosen: SimpleNamespace) -> options.Result:
     """Render pictures of many scenes under many lights from many cameras.
 
     Each mesh or scene among the FILEs is a scene of its own; environments among them are lights. All lights are seen
@@ -130,34 +84,26 @@ def command(**arguments: Any) -> None:
       jaxprt dataset chair.glb lamp.glb --lights "maps/*.hdr" --views 64 --output set
       jaxprt dataset *.glb grace.hdr --format png --size 256 --shards --output set
       jaxprt dataset scene.glb sun.exr --cameras transforms.json --layers color,alpha,depth,normal --output set
+
+    Options:
+        lights: More environments: a pattern such as "maps/*.hdr"; may be given several times.
+        random_turns: Rotate each light of each scene by N random angles about the vertical; 0 leaves them as they are.
+        views: Cameras on a sphere around each scene.
+        elevations: Lowest and highest elevation of these cameras in degrees.
+        cameras: Cameras of a transforms.json of NeRF or Blender, in place of --views.
+        size: Pixels of an edge.
+        seed: Seed of all random choices.
+        format: Linear EXR files with layers, or PNG files with alpha at the exposure of each scene and light.
+        shards: Pack the pictures of each scene into a tar file for WebDataset.
     """  # noqa: D301
-    chosen = SimpleNamespace(**arguments)
-    with options.reserve_stdout(chosen.as_json):
-        summary = render(chosen)
-    text = (
-        f"jaxprt: {summary['pictures']} pictures, scenes: {summary['scenes']}, in {chosen.output}; "
-        f"{summary['rate']:.1f} new ones a second"
-    )
-    options.tell(summary, text, as_json=chosen.as_json)
-    if summary["failed"]:
-        words = "; ".join(f"{name}: {why}" for name, why in summary["failed"].items())
-        raise click.ClickException(f"scenes that failed: {len(summary['failed'])}; {words}")
-
-
-def render(chosen: SimpleNamespace) -> dict[str, Any]:
-    """Renders all pictures that are missing.
-
-    Raises:
-        ValueError: There are no scenes or lights, an option is wrong, or the folder has the pictures of another set.
-    """
-    scenes, lights = _inputs(chosen)
+    (scenes, lights), recipe = _inputs(chosen), options.recipe(chosen, "a dataset")
     cameras = None if chosen.cameras is None else nerf.load(chosen.cameras, width=chosen.size)
-    relight.make_folder(chosen.output)
+    options.make_folder(chosen.output)
     _check_settings(chosen, list(lights))
     failed, new, began = {}, 0, time.monotonic()
     for number, (name, path) in enumerate(scenes.items(), 1):
         try:
-            count = _render_scene(name, path, lights, cameras, chosen)
+            count = _render_scene(name, path, lights, cameras, recipe, chosen)
             click.echo(f"jaxprt: {name} is done, scene {number} of {len(scenes)}: {count} new pictures", err=True)
             new += count
         except (ValueError, TypeError, OSError, MemoryError, RuntimeError) as error:
@@ -166,11 +112,15 @@ def render(chosen: SimpleNamespace) -> dict[str, Any]:
         except Exception as error:  # a fault of one scene does not stop the others
             failed[name] = f"{type(error).__name__}: {error}"
             click.echo(traceback.format_exc(), err=True)
-    seconds = time.monotonic() - began
-    done = [name for name in scenes if name not in failed]
-    rows = [row for name in done for row in _lines(chosen.output / name / _MANIFEST)]
+    rate, done = new / max(time.monotonic() - began, 1e-9), [name for name in scenes if name not in failed]
+    manifests = [chosen.output / name / _MANIFEST for name in done]
+    rows = [row for path in manifests for row in path.read_text().splitlines()]
     outputs.write(chosen.output / _MANIFEST, "".join(f"{row}\n" for row in rows))
-    return {"scenes": len(done), "pictures": len(rows), "new": new, "rate": new / max(seconds, 1e-9), "failed": failed}
+    summary = {"scenes": len(done), "pictures": len(rows), "new": new, "rate": rate, "failed": failed}
+    text = f"jaxprt: {len(rows)} pictures, scenes: {len(done)}, in {chosen.output}; {rate:.1f} new ones a second"
+    words = "; ".join(f"{name}: {why}" for name, why in failed.items())
+    error = click.ClickException(f"scenes that failed: {len(failed)}; {words}") if failed else None
+    return options.Result(summary, text, error)
 
 
 def _inputs(chosen: SimpleNamespace) -> tuple[dict[str, Path], dict[str, Environment]]:
@@ -186,23 +136,20 @@ def _inputs(chosen: SimpleNamespace) -> tuple[dict[str, Path], dict[str, Environ
         raise ValueError("a dataset needs a mesh or a scene, got none")
     if not lights:
         raise ValueError("a dataset needs an environment, got none: name EXR or HDR files, or --lights PATTERN")
-    if len(chosen.system) > 1 or len(chosen.lobes or ()) > 1:
-        raise ValueError("a dataset takes one system and one number of lobes, got several")
-    if chosen.layers is not None and chosen.form != "exr":
-        raise ValueError(f"--layers needs --format exr, got {chosen.form}")
+    if chosen.layers is not None and chosen.format != "exr":
+        raise ValueError(f"--layers needs --format exr, got {chosen.format}")
     low, *high = chosen.elevations
     if len(high) != 1 or not low <= high[0]:
         got = ",".join(f"{angle:g}" for angle in chosen.elevations)
         raise ValueError(f"--elevations must be two angles LOW,HIGH, the lower one first, got {got}")
-    named = SimpleNamespace(files=lights, light_size=chosen.light_size, turn=(0.0,))
     names = inputs.unique([path.stem for path in scenes])
-    return dict(zip(names, scenes, strict=True)), inputs.lights(named)
+    return dict(zip(names, scenes, strict=True)), inputs.lights(lights, light_size=chosen.light_size)
 
 
 def _check_settings(chosen: SimpleNamespace, lights: list[str]) -> None:
     """Writes what determines the pictures of a folder, or refuses a folder whose pictures have other settings."""
-    skipped = {"files", "lights", "output", "as_json", "outside"}
-    settings = {name: _text(value) for name, value in vars(chosen).items() if name not in skipped}
+    skipped = {"files", "lights", "output", "json", "outside"}
+    settings = options.finite({name: value for name, value in vars(chosen).items() if name not in skipped})
     settings |= {"lights": lights, "jaxprt": importlib.metadata.version("jaxprt")}
     path = chosen.output / _SETTINGS
     if path.exists():
@@ -218,17 +165,6 @@ def _check_settings(chosen: SimpleNamespace, lights: list[str]) -> None:
     if others:
         raise ValueError(f"--output must be an empty folder or one of an earlier dataset, got one with {others[0]}")
     outputs.write(path, json.dumps(settings, indent=2) + "\n")
-
-
-def _text(value: Any) -> Any:
-    """A setting as JSON."""
-    if isinstance(value, list | tuple):
-        return [_text(item) for item in value]
-    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
-
-
-def _lines(path: Path) -> list[str]:
-    return path.read_text().splitlines() if path.exists() else []
 
 
 @dataclasses.dataclass(frozen=True)
@@ -255,105 +191,120 @@ def _turned(name: str, lights: dict[str, Environment], *, turns: int, seed: int)
     return result
 
 
-def _around(name: str, scene: Scene, *, views: int, elevations: Sequence[float], size: int, seed: int) -> list[Camera]:
+def _around(name: str, scene: Scene, chosen: SimpleNamespace) -> list[Camera]:
     """Cameras that see the whole scene, spread evenly over a zone of the sphere that starts at a random angle."""
-    start = np.random.default_rng([seed, zlib.crc32(name.encode()), 1]).uniform(0, 2 * np.pi)
-    low, high = np.sin(np.radians(elevations))
-    heights = low + (high - low) * (np.arange(views) + 0.5) / views
-    mesh = scene.mesh
-    return [
-        orbit(mesh, azimuth=start + _GOLDEN * view, elevation=float(np.arcsin(height)), width=size, height=size)
-        for view, height in enumerate(heights)
-    ]
+    start = np.random.default_rng([chosen.seed, zlib.crc32(name.encode()), 1]).uniform(0, 2 * np.pi)
+    low, high = np.sin(np.radians(chosen.elevations))
+    elevation = np.arcsin(low + (high - low) * (np.arange(chosen.views) + 0.5) / chosen.views)
+    mesh, edge = scene.mesh, {"width": chosen.size, "height": chosen.size}
+    angles = [(start + _GOLDEN * view, float(angle)) for view, angle in enumerate(elevation)]
+    return [orbit(mesh, azimuth=azimuth, elevation=angle, **edge) for azimuth, angle in angles]
 
 
 def _render_scene(
-    name: str, path: Path, lights: dict[str, Environment], cameras: list[Camera] | None, chosen: SimpleNamespace
+    name: str,
+    path: Path,
+    lights: dict[str, Environment],
+    cameras: list[Camera] | None,
+    recipe: Recipe,
+    chosen: SimpleNamespace,
 ) -> int:
     """Renders what is missing of a scene. Returns the number of new pictures."""
     folder = chosen.output / name
     if (folder / _MANIFEST).exists():
         return 0
-    scene = inputs.scene(SimpleNamespace(**{**vars(chosen), "files": [path]}))
+    scene = options.call(inputs.scene, chosen, files=[path])
     low, high = bounds(scene.mesh)
     if not np.any(high > low):
         raise ValueError("a scene must have an extent, got one point")
-    if cameras is None:
-        options_ = {"views": chosen.views, "elevations": chosen.elevations, "size": chosen.size, "seed": chosen.seed}
-        cameras = _around(name, scene, **options_)
+    cameras = _around(name, scene, chosen) if cameras is None else cameras
     turned = _turned(name, lights, turns=chosen.random_turns, seed=chosen.seed)
-    (recipe,) = options.recipes(chosen.system[0], chosen, lobes=_LOBES).values()
-    size = turned[0].environment.radiance.shape[-2]
-    shown = sys.stderr.isatty()
-    relit = precompute(scene, system=recipe, bounces=chosen.bounces, refine=False, size=size, progress=shown)
+    wanted = {"bounces": chosen.bounces, "size": turned[0].environment.radiance.shape[-2]}
+    relit = precompute(scene, system=recipe, refine=False, progress=sys.stderr.isatty(), **wanted)
     folder.mkdir(exist_ok=True)
-    measured = _measured(relit, turned, cameras, folder)
-    new = _draw(relit, turned, cameras, measured, folder, chosen, name=name)
-    _finish(name, turned, cameras, measured, folder, chosen)
+    pictures = _Pictures(name, relit, turned, cameras, chosen)
+    measured = pictures.measured()
+    new = pictures.draw(measured)
+    pictures.finish(measured)
     return new
 
 
-def _measured(
-    relit: RelitScene, lights: list[_Light], cameras: list[Camera], folder: Path
-) -> dict[str, dict[str, float]]:
-    """For each light, the error of direct light in one view, and the exposure of pictures; measured once."""
-    path = folder / _SCENE
-    if path.exists():
-        return json.loads(path.read_text())
-    direct, environments = relit.without_bounces(), [light.environment for light in lights]
-    middle = cameras[len(cameras) // 2]
-    truth = exact_pixels(direct.scene, direct.shading, environments, middle, pixels=_PIXELS)
-    # The exposure is the least of some views: views of the lit side would be white at that of the dark side.
-    some = cameras[:: -(-len(cameras) // _EXPOSED)]
-    stops = np.full(len(lights), np.inf)
-    for block in relit.picture_blocks(environments, some, memory=_MEMORY):
-        for number, picture in zip(block.lights, block.pictures, strict=True):
-            stops[number] = min(stops[number], float(relit.exposure(picture, some[block.view])))
-    result = {}
-    for number, light in enumerate(lights):
-        error, spread = truth.relative_l2(direct.picture(light.environment, middle), light=number)
-        values = {"error": float(error), "spread": float(spread), "stops": float(stops[number])}
-        result[light.name] = options.finite(values)
-    outputs.write(path, json.dumps(result, indent=2) + "\n")
-    return result
+@dataclasses.dataclass(frozen=True)
+class _Pictures:
+    """The pictures of a scene under its lights from its cameras."""
 
+    name: str
+    relit: RelitScene
+    lights: list[_Light]
+    cameras: list[Camera]
+    chosen: SimpleNamespace
 
-def _draw(
-    relit: RelitScene,
-    lights: list[_Light],
-    cameras: list[Camera],
-    measured: dict[str, dict[str, float]],
-    folder: Path,
-    chosen: SimpleNamespace,
-    *,
-    name: str,
-) -> int:
-    """Writes the pictures that are missing. Returns their number."""
-    missing = {
-        view: [number for number, light in enumerate(lights) if not _path(folder, view, light, chosen.form).exists()]
-        for view in range(len(cameras))
-    }
-    total = sum(map(len, missing.values()))
-    layers = chosen.layers or ("color", "alpha")
-    with tqdm.tqdm(total=total, desc=name, unit="picture", disable=not sys.stderr.isatty()) as bar:
-        for numbers in sorted(set(map(tuple, missing.values()))):  # all lights, as a rule
-            views = [view for view, some in missing.items() if tuple(some) == numbers and numbers]
-            if not views:
-                continue
-            environments, eyes = [lights[k].environment for k in numbers], [cameras[view] for view in views]
-            blocks = relit.picture_blocks(environments, eyes, background=None, layers=layers, memory=_MEMORY)
-            for block in blocks:
-                for number, at in enumerate(block.lights):
-                    light = lights[numbers[at]]
-                    picture = {key: value[number] for key, value in block.pictures.items()}
-                    path = _path(folder, views[block.view], light, chosen.form)
-                    _write(path, picture, stops=measured[light.name]["stops"])
-                    bar.update()
-    return total
+    @property
+    def folder(self) -> Path:
+        return self.chosen.output / self.name
 
+    def path(self, view: int, light: _Light) -> Path:
+        return self.folder / f"{view:04d}_{light.name}.{self.chosen.format}"
 
-def _path(folder: Path, view: int, light: _Light, form: str) -> Path:
-    return folder / f"{view:04d}_{light.name}.{form}"
+    def measured(self) -> dict[str, dict[str, float]]:
+        """For each light, the error of direct light in one view, and the exposure of pictures; measured once."""
+        path = self.folder / _SCENE
+        if path.exists():
+            return json.loads(path.read_text())
+        direct, environments = self.relit.without_bounces(), [light.environment for light in self.lights]
+        middle = self.cameras[len(self.cameras) // 2]
+        truth = exact_pixels(direct.scene, direct.shading, environments, middle, pixels=_PIXELS)
+        # The exposure is the least of some views: views of the lit side would be white at that of the dark side.
+        some = self.cameras[:: -(-len(self.cameras) // _EXPOSED)]
+        stops = np.full(len(self.lights), np.inf)
+        for block in self.relit.picture_blocks(environments, some, memory=_MEMORY):
+            for number, picture in zip(block.lights, block.pictures, strict=True):
+                stops[number] = min(stops[number], float(self.relit.exposure(picture, some[block.view])))
+        result = {}
+        for number, light in enumerate(self.lights):
+            error, spread = truth.relative_l2(direct.picture(light.environment, middle), light=number)
+            result[light.name] = options.finite({"error": error, "spread": spread, "stops": stops[number]})
+        outputs.write(path, json.dumps(result, indent=2) + "\n")
+        return result
+
+    def draw(self, measured: dict[str, dict[str, float]]) -> int:
+        """Writes the pictures that are missing. Returns their number."""
+        views: dict[tuple[int, ...], list[int]] = {}  # by the lights whose pictures are missing: all, as a rule
+        for view in range(len(self.cameras)):
+            missing = [k for k, light in enumerate(self.lights) if not self.path(view, light).exists()]
+            views.setdefault(tuple(missing), []).append(view)
+        views.pop((), None)
+        total = sum(len(lights) * len(members) for lights, members in views.items())
+        layers = self.chosen.layers or ("color", "alpha")
+        with tqdm.tqdm(total=total, desc=self.name, unit="picture", disable=not sys.stderr.isatty()) as bar:
+            for missing, members in sorted(views.items()):
+                lights, eyes = [self.lights[k] for k in missing], [self.cameras[view] for view in members]
+                drawn = {"background": None, "layers": layers, "memory": _MEMORY}
+                for block in self.relit.picture_blocks([light.environment for light in lights], eyes, **drawn):
+                    for number, light in enumerate(lights[k] for k in block.lights):
+                        picture = {layer: values[number] for layer, values in block.pictures.items()}
+                        path = self.path(members[block.view], light)
+                        _write(path, picture, stops=measured[light.name]["stops"])
+                        bar.update()
+        return total
+
+    def finish(self, measured: dict[str, dict[str, float]]) -> None:
+        """Writes the cameras, the tar file if asked for, and last the lines of the manifest."""
+        frames, rows, views, output = [], [], [], self.chosen.output
+        shard = {"shard": f"{self.name}.tar"} if self.chosen.shards else {}
+        for view, light in itertools.product(range(len(self.cameras)), self.lights):
+            file, source = self.path(view, light).name, {"light": light.source, "turn": light.turn}
+            frames.append({"file_path": f"./{file}", **source})
+            row = {"scene": self.name, "file": f"{self.name}/{file}", "view": view, **source, **shard}
+            rows.append(row | {"seed": self.chosen.seed, **measured[light.name]})
+            views.append(view)
+        content = nerf.content(self.cameras, frames, views)
+        outputs.write(self.folder / _FRAMES, json.dumps(content, indent=2) + "\n")
+        if shard:
+            _pack(output / f"{self.name}.tar", output, rows)
+        outputs.write(self.folder / _MANIFEST, "".join(json.dumps(row) + "\n" for row in rows))
+        for row in rows if shard else ():
+            (output / row["file"]).unlink(missing_ok=True)
 
 
 def _write(path: Path, picture: dict[str, np.ndarray], *, stops: float) -> None:
@@ -366,46 +317,12 @@ def _write(path: Path, picture: dict[str, np.ndarray], *, stops: float) -> None:
     files.write_png(path, np.concatenate([shown, alpha], -1))
 
 
-def _finish(
-    name: str,
-    lights: list[_Light],
-    cameras: list[Camera],
-    measured: dict[str, dict[str, float]],
-    folder: Path,
-    chosen: SimpleNamespace,
-) -> None:
-    """Writes the cameras, the tar file if asked for, and last the lines of the manifest."""
-    pairs = [(view, light) for view in range(len(cameras)) for light in lights]
-    frames = [
-        {"file_path": f"./{_path(folder, view, light, chosen.form).name}", "light": light.source, "turn": light.turn}
-        for view, light in pairs
-    ]
-    content = nerf.content(cameras, frames, [view for view, _ in pairs])
-    outputs.write(folder / _FRAMES, json.dumps(content, indent=2) + "\n")
-    rows = []
-    for view, light in pairs:
-        file = _path(folder, view, light, chosen.form)
-        row = {"scene": name, "file": f"{name}/{file.name}", "view": view, "light": light.source, "turn": light.turn}
-        if chosen.shards:
-            row["shard"] = f"{name}.tar"
-        rows.append(row | {"seed": chosen.seed, **measured[light.name]})
-    if chosen.shards:
-        _pack(chosen.output / f"{name}.tar", chosen.output, rows)
-    outputs.write(folder / _MANIFEST, "".join(json.dumps(row) + "\n" for row in rows))
-    for row in rows if chosen.shards else ():
-        (chosen.output / row["file"]).unlink(missing_ok=True)
-
-
 def _pack(path: Path, folder: Path, rows: Sequence[dict[str, Any]]) -> None:
     """Writes a tar file with each picture and its line of the manifest, without times and owners."""
     with outputs.replacing(path) as new, tarfile.open(new, "w", format=tarfile.USTAR_FORMAT) as archive:
         for row in rows:
-            for member, data in _members(folder, row):
+            line = str(Path(row["file"]).with_suffix(".json")), json.dumps(row).encode()
+            for member, data in ((row["file"], (folder / row["file"]).read_bytes()), line):
                 entry = tarfile.TarInfo(member)
                 entry.size = len(data)
                 archive.addfile(entry, io.BytesIO(data))
-
-
-def _members(folder: Path, row: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
-    yield row["file"], (folder / row["file"]).read_bytes()
-    yield str(Path(row["file"]).with_suffix(".json")), json.dumps(row).encode()

@@ -2,89 +2,53 @@
 
 import json
 import os
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import click
-import numpy as np
 
-from jaxprt.cli import inputs, options, play, relight
-from jaxprt.cli.options import option
+from jaxprt.cli import inputs, options
 from jaxprt.files import outputs
+from jaxprt.relit import RelitScene
+from jaxprt.relit.build import precompute
 from jaxprt.scene import Environment, light_probe
 from jaxprt.scene.light_probes import TOOLS
 from jaxprt.view import export, export_baked, export_gltf, gltf, page_error
 
 _KINDS = {".html": "page", ".glb": "baked", ".json": "probes"}
-_BAKED, _TRANSFER = "baked", "gltf"  # formats of *.glb
 
 
-@click.command(cls=options.Command, short_help="Export web pages, baked glTF, and light probes.")
-@options.scene
-@options.light
-@option(
-    "--output",
-    "-o",
-    group="Output",
-    type=click.Path(path_type=Path),
-    multiple=True,
-    required=True,
-    metavar="FILE",
-    help="File to write: *.html, *.glb or *.json. May be given several times.",
+@options.command(
+    "export",
+    "Export web pages, baked glTF, and light probes.",
+    options.FILES,
+    Scene=options.SCENE,
+    Light=options.LIGHT,
+    Output=[
+        click.Option(
+            ["--output", "-o"],
+            type=click.Path(path_type=Path),
+            multiple=True,
+            required=True,
+            metavar="FILE",
+            help="File to write: *.html, *.glb or *.json. May be given several times.",
+        ),
+        {"format": (click.Choice(["baked", "gltf"]), "baked")},
+        *options.options_of(export_gltf, degree=options.Range(0, gltf.MOST_DEGREE)),
+        *options.options_of(export, most=options.Range(1, name="bytes")),
+        {
+            "error": (options.Range(0.0, kind=float, name="E"), page_error.NOTABLE),
+            "tool": (options.Several(click.Choice(TOOLS, case_sensitive=False)), TOOLS),
+            "store": (click.Path(path_type=Path, file_okay=False),),
+        },
+        options.JSON,
+    ],
+    System=[options.systems(("lobe", "harmonic", "dynamic"), "Of pages and scenes."), options.NO_BOUNCES],
+    Sizes=options.FEW_SIZES,
 )
-@option(
-    "--format",
-    group="Output",
-    type=click.Choice([_BAKED, _TRANSFER]),
-    default=_BAKED,
-    show_default=True,
-    help="What *.glb holds: colors of one light and view, or transfer in vertex attributes and materials.",
-)
-@option(
-    "--degree",
-    group="Output",
-    type=options.Whole(0, gltf.MOST_DEGREE),
-    default=gltf.DEGREE,
-    show_default=True,
-    help="Degree of the harmonics of the transfer in *.glb.",
-)
-@options.systems(("lobe", "harmonic", "dynamic"), default="lobe", words="Of pages and scenes.  [default: lobe]")
-@options.no_bounces
-@options.few_sizes
-@option(
-    "--most",
-    group="Output",
-    type=options.Whole(1),
-    metavar="BYTES",
-    default=32_000_000,
-    show_default=True,
-    help="Largest size of the page in bytes.",
-)
-@option(
-    "--error",
-    group="Output",
-    type=options.Finite(0.0),
-    metavar="E",
-    default=page_error.NOTABLE,
-    show_default=True,
-    help="Largest relative L2 error of the page's pictures. A page with more is not written; the message says why.",
-)
-@option(
-    "--tool",
-    group="Output",
-    type=options.Several(click.Choice(TOOLS, case_sensitive=False)),
-    default=",".join(TOOLS),
-    help="Tools for which *.json has light probes.  [default: all]",
-)
-@option(
-    "--store",
-    group="Output",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="Folder that keeps precomputed data for later runs.",
-)
-@options.as_json
-def command(**arguments: Any) -> None:
+def command(chosen: SimpleNamespace) -> options.Result:
     """Write a scene or its lights for other programs.
 
     \b
@@ -100,34 +64,45 @@ def command(**arguments: Any) -> None:
       jaxprt export scene.glb grace.hdr --output piece.html --output baked.glb --system harmonic --store kept
       jaxprt export scene.glb grace.hdr --format gltf --output prt.glb
       jaxprt export grace.hdr uffizi.hdr --output probes.json --tool three.js
+
+    Options:
+        format: What *.glb holds: colors of one light and view, or transfer in vertex attributes and materials.
+        error: Largest relative L2 error of the page's pictures: a page with more is not written; the message says why.
+        tool: Tools for which *.json has light probes.
+        store: Folder that keeps precomputed data for later runs.
     """  # noqa: D301
-    chosen = SimpleNamespace(**arguments)
-    _check(chosen)
-    with options.reserve_stdout(chosen.as_json):
-        files = _write(chosen)
-    rows = [f"jaxprt: {row['path']}, {row['bytes']:,} bytes{row.pop('words')}" for row in files]
-    options.tell(files, "\n".join(rows), as_json=chosen.as_json)
-
-
-def _check(chosen: SimpleNamespace) -> None:
-    """Refuses files that cannot be written, before anything is computed."""
+    recipe = options.recipe(chosen, "an export")
     for path in chosen.output:
-        if path.suffix.lower() not in _KINDS:
-            raise click.UsageError(f"--output must end in {', '.join(_KINDS)}, got {path}")
-        if not path.parent.exists():
-            raise click.UsageError(f"--output must be in a folder that exists, got {path}: there is no {path.parent}")
-        if os.path.isdir(path):
-            raise click.UsageError(f"--output must be a file, got the folder {path}")
-    if len(chosen.system) > 1 or len(chosen.lobes or ()) > 1:
-        raise click.UsageError("an export takes one system and one number of lobes, got several")
+        _check(path)
+    options.make_folder(chosen.store, name="--store")
+    lights, ready, rows, texts = options.call(inputs.lights, chosen), None, [], []
     for path in chosen.output:
-        _check_writable(path)
-    if chosen.store is not None:
-        relight.make_folder(chosen.store, name="--store")
+        kind = _KINDS[path.suffix.lower()]
+        if kind == "probes":
+            text = _write_probes(path, lights, chosen.tool)
+            row = {}
+        else:
+            if ready is None:
+                scene = options.call(inputs.scene, chosen, playable=True)
+                size = next(iter(lights.values())).radiance.shape[-2]
+                wanted = {"size": size, "bounces": chosen.bounces, "path": chosen.store}
+                shown = {"refine": False, "progress": sys.stderr.isatty()}
+                ready = precompute(scene, system=recipe, **wanted, **shown)
+            kind, row, text = _write(path, kind, ready, lights, chosen)
+        size = path.stat().st_size
+        rows.append({"path": path, "kind": kind, "bytes": size, **row})
+        texts.append(f"jaxprt: {path}, {size:,} bytes{text}")
+    return options.Result(rows, "\n".join(texts))
 
 
-def _check_writable(path: Path) -> None:
-    """Opens the file for writing, because permissions alone do not tell. An existing file is not changed."""
+def _check(path: Path) -> None:
+    """Refuses a file that cannot be written. It is opened, because permissions alone do not tell, and not changed."""
+    if path.suffix.lower() not in _KINDS:
+        raise click.UsageError(f"--output must end in {', '.join(_KINDS)}, got {path}")
+    if not path.parent.exists():
+        raise click.UsageError(f"--output must be in a folder that exists, got {path}: there is no {path.parent}")
+    if os.path.isdir(path):
+        raise click.UsageError(f"--output must be a file, got the folder {path}")
     new = not os.path.lexists(path)
     try:
         with path.open("ab"):
@@ -135,48 +110,33 @@ def _check_writable(path: Path) -> None:
         if new:
             path.unlink()
     except OSError as error:
-        raise click.ClickException(
-            f"--output must be a file that can be written, got {path}: {error.strerror}"
-        ) from error
+        reason = f"--output must be a file that can be written, got {path}: {error.strerror}"
+        raise click.ClickException(reason) from error
 
 
-def _write(chosen: SimpleNamespace) -> list[dict[str, Any]]:
-    """Writes all files. Returns a description of each."""
-    lights, ready, rows = inputs.lights(chosen), None, []
-    for path in chosen.output:
-        kind = _KINDS[path.suffix.lower()]
-        if kind == "probes":
-            rows.append(probes(path, lights, chosen.tool))
-            continue
-        if ready is None:
-            (recipe,) = options.recipes(chosen.system[0], chosen, lobes=play.LOBES).values()
-            scene = inputs.scene(chosen, playable=True)
-            ready = play.precompute_scene(scene, lights, recipe, chosen.bounces, chosen.store)
-        if kind == "page":
-            piece = export(ready, path, environments=lights, most=chosen.most, error=chosen.error)
-            causes = {cause.name: cause.error for cause in piece.causes}
-            row = {"error": piece.error, "causes": causes, "visibility_edge": piece.edge, "degree": piece.degree}
-            words = f", {100 * piece.error:.1f} % off pictures of the scene in the light {piece.light!r}"
-            words += "".join(f"\n  {cause}" for cause in piece.causes)
-        elif chosen.format == _TRANSFER:
-            kind = "transfer"
-            export_gltf(ready, path, environments=lights, degree=chosen.degree)
-            row = {"degree": chosen.degree}
-            words = f", with transfer of degree {chosen.degree} in vertex attributes, and lights {', '.join(lights)}"
-        else:
-            name, light = next(iter(lights.items()))
-            row = {"light": name, "exposure": export_baked(ready, path, light)}
-            words = f", in the light of {name}; its colors times {row['exposure']:.4g} are radiance"
-        rows.append({"path": str(path), "kind": kind, "bytes": path.stat().st_size, **row, "words": words})
-    return rows
+def _write(
+    path: Path, kind: str, scene: RelitScene, lights: dict[str, Environment], chosen: SimpleNamespace
+) -> tuple[str, dict[str, Any], str]:
+    """Writes a scene. Returns the kind of the file, and its description as JSON and as text."""
+    if kind == "page":
+        piece = export(scene, path, environments=lights, most=chosen.most, error=chosen.error)
+        text = f", {100 * piece.error:.1f} % off pictures of the scene in the light {piece.light!r}"
+        text += "".join(f"\n  {cause}" for cause in piece.causes)
+        causes = {cause.name: cause.error for cause in piece.causes}
+        row = {"error": piece.error, "causes": causes, "visibility_edge": piece.edge, "degree": piece.degree}
+        return kind, row, text
+    if chosen.format == "gltf":
+        export_gltf(scene, path, environments=lights, degree=chosen.degree)
+        text = f", with transfer of degree {chosen.degree} in vertex attributes, and lights {', '.join(lights)}"
+        return "transfer", {"degree": chosen.degree}, text
+    name, light = next(iter(lights.items()))
+    exposure = export_baked(scene, path, light)
+    text = f", in the light of {name}; its colors times {exposure:.4g} are radiance"
+    return kind, {"light": name, "exposure": exposure}, text
 
 
-def probes(path: Path, lights: dict[str, Environment], tools: tuple[str, ...]) -> dict[str, Any]:
+def _write_probes(path: Path, lights: dict[str, Environment], tools: tuple[str, ...]) -> str:
     """Writes light probes. Returns a description of the file."""
-    content = {
-        tool: {name: np.asarray(light_probe(light, tool=tool), float).tolist() for name, light in lights.items()}
-        for tool in tools
-    }
-    outputs.write(path, json.dumps(content, indent=2) + "\n")
-    words = f", nine colors of each of {', '.join(lights)} for {', '.join(tools)}"
-    return {"path": str(path), "kind": "probes", "bytes": path.stat().st_size, "words": words}
+    content = {tool: {name: light_probe(light, tool=tool) for name, light in lights.items()} for tool in tools}
+    outputs.write(path, json.dumps(options.finite(content), indent=2) + "\n")
+    return f", nine colors of each of {', '.join(lights)} for {', '.join(tools)}"

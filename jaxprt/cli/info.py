@@ -6,6 +6,7 @@ import math
 import platform
 import re
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +18,6 @@ import numpy as np
 import jaxprt
 from jaxprt import brdf, compile
 from jaxprt.cli import inputs, options
-from jaxprt.cli.options import option
 from jaxprt.files import inputs as regular
 from jaxprt.files import read_image
 from jaxprt.scene import TexturedMaterial, load_environment, load_scene
@@ -32,23 +32,19 @@ _WRONG = (
     "the compiler of this installation must compute right sums, got wrong ones (see jax-ml/jax#39103): install another "
     "version of jaxlib"
 )
+_LIBRARIES = ("jax", "jaxlib", "numpy", "embreex")
 _NAMES = 6  # most names of a file's materials that the text lists
 
 
-@click.command(cls=options.Command, short_help="Describe meshes, scenes, environments, BRDFs and stores.")
-@click.argument("files", metavar="PATH...", type=click.Path(exists=True, path_type=Path), nargs=-1)
-@option(
-    "--light-size",
-    group="Light",
-    type=options.Whole(1, 1024),
-    default=64,
-    show_default=True,
-    metavar="N",
-    help="Texels along the edge of the cubemap faces whose brightest texels are counted.",
+@options.command(
+    "info",
+    "Describe meshes, scenes, environments, BRDFs and stores.",
+    click.Argument(["files"], metavar="PATH...", type=click.Path(exists=True, path_type=Path), nargs=-1),
+    Light=[{"light_size": (options.Range(1, 1024), inputs.LIGHT_SIZE)}],
+    Scene=options.options_of(load_scene, outside=bool),
+    Output=[options.JSON],
 )
-@options.outside
-@options.as_json
-def command(**arguments: Any) -> None:
+def command(chosen: SimpleNamespace) -> options.Result:
     """Describe the content of files: meshes and scenes, environments, BRDFs, and folders written by jaxprt.
 
     Without files, describe the installation: versions, the device, and whether its compiler computes right sums.
@@ -59,70 +55,55 @@ def command(**arguments: Any) -> None:
       jaxprt info scene.glb grace.hdr
       jaxprt info lafortune.json ngan2005_wardduer.fit gold-paint.binary
       jaxprt info kept out/ --json
+
+    Options:
+        light_size: Texels along the edge of the cubemap faces whose brightest texels are counted.
     """  # noqa: D301
-    chosen = SimpleNamespace(**arguments)
     if not chosen.files:
-        here = installation()
-        options.tell(here, _versions(here), as_json=chosen.as_json)
-        if here["wrong_sums"]:
-            raise ValueError(_WRONG)
-        return
+        here = _installation()
+        versions = ", ".join(f"{name} {here[name]}" for name in ("jaxprt", *_LIBRARIES))
+        sums = f"{here['wrong_sums']} wrong sums" if here["wrong_sums"] else "right"
+        text = f"{versions}, Python {here['python']}\ndevice {here['platform']}, {here['device']}\ncompiler {sums}"
+        return options.Result(here, text, ValueError(_WRONG) if here["wrong_sums"] else None)
     facts, refused = [], []
     for path in chosen.files:
         try:
             facts.append(describe_path(path, chosen.light_size, outside=chosen.outside))
         except (ValueError, OSError) as error:
             refused.append(options.message_of(error))
-    options.tell(facts, "\n".join(map(_text, facts)), as_json=chosen.as_json)
-    if refused:
-        raise ValueError("\n".join(refused))
+    text = "\n".join(row for described in facts for row in _rows(described))
+    return options.Result(facts, text, ValueError("\n".join(refused)) if refused else None)
 
 
-def installation() -> dict[str, Any]:
+def _installation() -> dict[str, Any]:
     """Describes this installation, as JSON: versions, the device, and wrong sums of its compiler."""
     device = jax.devices()[0]
-    versions = {name: importlib.metadata.version(name) for name in ("jax", "jaxlib", "numpy", "embreex")}
     return {
         "python": platform.python_version(),
         "jaxprt": jaxprt.__version__,
-        **versions,
+        **{name: importlib.metadata.version(name) for name in _LIBRARIES},
         "device": device.device_kind,
         "platform": device.platform,
         "wrong_sums": compile.wrong_sums(),
     }
 
 
-def _versions(here: dict[str, Any]) -> str:
-    names = ("jaxprt", "jax", "jaxlib", "numpy", "embreex")
-    versions = ", ".join(f"{name} {here[name]}" for name in names)
-    sums = f"{here['wrong_sums']} wrong sums" if here["wrong_sums"] else "right"
-    return f"{versions}, Python {here['python']}\ndevice {here['platform']}, {here['device']}\ncompiler {sums}"
-
-
 def describe_path(path: Path, light_size: int, *, outside: bool) -> dict[str, Any]:
     """Describes the content of a file or folder, as JSON."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        description = {"path": str(path), **_describe_file(path, light_size, outside)}
-    if caught:
-        description["left_out"] = [str(warning.message) for warning in caught]
-    return description
-
-
-def _describe_file(path: Path, light_size: int, outside: bool) -> dict[str, Any]:
-    if path.is_dir():
-        return _folder(path)
-    kind = inputs.kind(path)
-    if kind == "mesh":
-        return _scene(path, outside)
-    if kind == "light":
-        return _light(path, light_size)
-    return _brdf(path)
+        if path.is_dir():
+            facts = _folder(path)
+        elif kind := inputs.kind(path):
+            facts = _scene(path, outside) if kind == "mesh" else _light(path, light_size)
+        else:
+            facts = _brdf(path)
+    left_out = {"left_out": [str(warning.message) for warning in caught]} if caught else {}
+    return options.finite({"path": path, **facts, **left_out})
 
 
 def _scene(path: Path, outside: bool) -> dict[str, Any]:
     scene = load_scene(path, outside=outside)
-    low, high = (np.asarray(corner, float).tolist() for corner in bounds(scene.mesh))
     parts = [
         {
             "name": part.name,
@@ -135,15 +116,11 @@ def _scene(path: Path, outside: bool) -> dict[str, Any]:
         for part in scene.parts
     ]
     cameras = [
-        {
-            "eye": np.asarray(camera.eye, float).tolist(),
-            "target": np.asarray(camera.target, float).tolist(),
-            "field_of_view_degrees": float(np.degrees(camera.field_of_view)),
-        }
+        {"eye": camera.eye, "target": camera.target, "field_of_view_degrees": np.degrees(camera.field_of_view)}
         for camera in scene.cameras
     ]
     total = {name: sum(part[name] for part in parts) for name in ("vertices", "triangles")}
-    return {"kind": "scene", **total, "bounds": [low, high], "parts": parts, "cameras": cameras}
+    return {"kind": "scene", **total, "bounds": bounds(scene.mesh), "parts": parts, "cameras": cameras}
 
 
 def _light(path: Path, size: int) -> dict[str, Any]:
@@ -158,11 +135,11 @@ def _light(path: Path, size: int) -> dict[str, Any]:
         "pixels": [image.shape[1], image.shape[0]],
         "channels": image.shape[2],
         "layout": layout_of(image, attributes, str(path)),
-        "radiance": {"least": float(colors.min()), "most": float(colors.max())},
-        "negative_pixels": int((colors < 0).any(-1).sum()),
-        "mean_radiance": (np.einsum("fijc,fij->c", light, solid) / (4 * math.pi)).tolist(),
+        "radiance": {"least": colors.min(), "most": colors.max()},
+        "negative_pixels": np.count_nonzero((colors < 0).any(-1)),
+        "mean_radiance": np.einsum("fijc,fij->c", light, solid) / (4 * math.pi),
         "texels": [6, size, size],
-        "brightest_share": {str(n): float(power[:n].sum() / total) if total else 0.0 for n in _BRIGHTEST},
+        "brightest_share": {n: power[:n].sum() / total if total else 0.0 for n in _BRIGHTEST},
     }
 
 
@@ -171,27 +148,20 @@ def _brdf(path: Path) -> dict[str, Any]:
     regular.check(path, "a mesh, an environment or a BRDF")
     with path.open("rb") as file:
         start = file.read(4096)
+    names, suffix = path.with_name("merl_npf_materials.txt"), path.suffix.lower()
     if start.startswith(_MERL):
-        table = brdf.load_merl(path)
-        return {"kind": "brdf", "form": "merl", "brdf": inputs.describe(table), "use": f"merl:{path}"}
-    if path.suffix.lower() == ".bin" and path.with_name("merl_npf_materials.txt").exists():
-        names = path.with_name("merl_npf_materials.txt").read_text(encoding="utf-8").split()
-        brdf.load_npf(path, names[0])
-        return _brdf_facts("npf", path, names)
-    text = start.decode("utf-8", errors="replace")
-    if path.suffix.lower() == ".json":
+        return {"kind": "brdf", "form": "merl", "brdf": inputs.describe(brdf.load_merl(path)), "use": f"merl:{path}"}
+    if suffix == ".bin" and names.exists():
+        return _materials("npf", path, names.read_text(encoding="utf-8").split())
+    if suffix == ".json":
         known = regular.json_object(path, "a file of Lafortune BRDFs").get("materials")
         if not isinstance(known, dict) or not known:
             raise ValueError(f"{path} must be JSON with materials, got none")
-        names = list(known)
-        brdf.load_lafortune(path, names[0])
-        return _brdf_facts("lafortune", path, names)
-    if "Aggregate(Lambertian(" in text:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-        names = [match[1] for match in (re.match(r"([\w-]+) *= *Aggregate", line) for line in lines) if match]
-        facts = _brdf_facts("ngan", path, names)
-        return {**facts, "model": type(brdf.load_ngan(path, names[0])).__name__}
-    if path.suffix.lower() == ".brdf":
+        return _materials("lafortune", path, list(known))
+    if b"Aggregate(Lambertian(" in start:
+        text = path.read_text(encoding="utf-8", errors="replace")
+        return _materials("ngan", path, re.findall(r"^([\w-]+) *= *Aggregate", text, re.MULTILINE))
+    if suffix == ".brdf":
         samples = len(brdf.scattered.read_scattered(path)[0])
         return {"kind": "brdf", "form": "scattered", "samples": samples, "use": f"scattered:{path}"}
     known = ", ".join((*inputs.SUFFIXES, *inputs.LIGHTS))
@@ -201,8 +171,11 @@ def _brdf(path: Path) -> dict[str, Any]:
     )
 
 
-def _brdf_facts(form: str, path: Path, names: list[str]) -> dict[str, Any]:
-    return {"kind": "brdf", "form": form, "materials": names, "use": f"{form}:{path},material={names[0]}"}
+def _materials(form: str, path: Path, names: list[str]) -> dict[str, Any]:
+    """Describes a file of several BRDFs, of which the first must be one."""
+    model = type(inputs.FILES[form][0](path, names[0])).__name__
+    facts = {"kind": "brdf", "form": form, "materials": names, "use": f"{form}:{path},material={names[0]}"}
+    return facts | ({"model": model} if form == "ngan" else {})
 
 
 def _folder(path: Path) -> dict[str, Any]:
@@ -216,11 +189,8 @@ def _folder(path: Path) -> dict[str, Any]:
     inside = sorted({file.parent for name in ("object.json", "store.json") for file in path.rglob(name)})
     if not inside:
         raise ValueError(f"{path} must be a folder that jaxprt wrote, got one without saved objects and stores")
-    return {
-        "kind": "folder",
-        "bytes": nbytes,
-        "inside": [{"path": str(folder), **_folder(folder)} for folder in inside],
-    }
+    members = [{"path": str(folder), **_folder(folder)} for folder in inside]
+    return {"kind": "folder", "bytes": nbytes, "inside": members}
 
 
 def _describe_store(path: Path, nbytes: int) -> dict[str, Any]:
@@ -230,14 +200,9 @@ def _describe_store(path: Path, nbytes: int) -> dict[str, Any]:
         what = tree.get("class", next(iter(tree), "value")).rpartition(":")[2]
         return {"kind": "object", "holds": what, "bytes": nbytes}
     header = regular.json_object(path / "store.json", "the header of a store")
-    return {
-        "kind": "store",
-        "holds": header.get("system", "blocks"),
-        "bytes": nbytes,
-        "blocks": int(header["blocks"]),
-        "finished": _finished_blocks(path / "checksum.npy", header["blocks"]),
-        "blocks_of": {name: shape[:-1] for name, shape in header["shapes"].items()},
-    }
+    facts = {"kind": "store", "holds": header.get("system", "blocks"), "bytes": nbytes}
+    facts |= {"blocks": header["blocks"], "finished": _finished_blocks(path / "checksum.npy", header["blocks"])}
+    return facts | {"blocks_of": {name: shape[:-1] for name, shape in header["shapes"].items()}}
 
 
 def _finished_blocks(path: Path, blocks: int) -> int:
@@ -250,41 +215,35 @@ def _finished_blocks(path: Path, blocks: int) -> int:
     return int(np.count_nonzero(np.frombuffer(sums[: len(sums) // 4 * 4], np.uint32)))
 
 
-def _text(facts: dict[str, Any], indent: str = "") -> str:
-    """The description as text."""
-    rows = {"scene": _scene_rows, "environment": _light_rows, "brdf": _brdf_rows}.get(facts["kind"], _folder_rows)(
-        facts
-    )
-    rows = [f"{indent}{facts['path']}: {rows[0]}", *(f"{indent}  {row}" for row in rows[1:])]
-    rows += [f"{indent}  left out: {reason}" for reason in facts.get("left_out", [])]
-    return "\n".join([*rows, *(_text(part, f"{indent}  ") for part in facts.get("inside", []))])
+def _rows(facts: dict[str, Any]) -> Iterator[str]:
+    """The description as rows of text."""
+    head, *rows = {"scene": _scene_rows, "environment": _light_rows, "brdf": _brdf_rows}.get(
+        facts["kind"], _folder_rows
+    )(facts)
+    yield f"{facts['path']}: {head}"
+    rows += [f"left out: {reason}" for reason in facts.get("left_out", [])]
+    rows += [row for member in facts.get("inside", []) for row in _rows(member)]
+    yield from (f"  {row}" for row in rows)
 
 
-def _scene_rows(facts: dict[str, Any]) -> list[str]:
-    (low, high), cameras = facts["bounds"], len(facts["cameras"])
-    size = " x ".join(f"{b - a:.4g}" for a, b in zip(low, high, strict=True))
-    rows = [
-        f"scene of {len(facts['parts'])} parts, {facts['vertices']} vertices, {facts['triangles']} triangles, "
-        f"{size} units, {cameras} cameras"
-    ]
+def _scene_rows(facts: dict[str, Any]) -> Iterator[str]:
+    counts = "{vertices} vertices, {triangles} triangles"
+    size = " x ".join(f"{high - low:.4g}" for low, high in zip(*facts["bounds"], strict=True))
+    head = f"scene of {len(facts['parts'])} parts, {counts.format(**facts)}"
+    yield f"{head}, {size} units, {len(facts['cameras'])} cameras"
     for number, part in enumerate(facts["parts"]):
-        material = part["material"]
-        values = [
-            f"{name} {_value(value)}" for name, value in material.items() if name != "model" and _matters(name, value)
-        ]
-        rows.append(
-            f"{number} {part['name']!r}: {part['vertices']} vertices, {part['triangles']} triangles, "
-            f"{material['model']}({', '.join(values)})"
-        )
+        material = dict(part["material"])
+        model = material.pop("model")
+        values = ", ".join(f"{name} {_value(value)}" for name, value in material.items() if _matters(name, value))
+        yield f"{number} {part['name']!r}: {counts.format(**part)}, {model}({values})"
     for number, camera in enumerate(facts["cameras"]):
-        eye = _value(camera["eye"])
-        rows.append(f"camera {number}: at {eye}, {camera['field_of_view_degrees']:.4g} degrees high")
-    return rows
+        angle = f"{camera['field_of_view_degrees']:.4g}"
+        yield f"camera {number}: at {_value(camera['eye'])}, {angle} degrees high"
 
 
 def _matters(name: str, value: Any) -> bool:
     """Whether a parameter of a material differs from its default in glTF."""
-    default = {key: standard for key, standard in inputs.describe(TexturedMaterial()).items() if key != "model"}
+    default = inputs.describe(TexturedMaterial())
     return name not in default or not np.array_equal(value, default[name])
 
 
@@ -306,23 +265,23 @@ def _light_rows(facts: dict[str, Any]) -> list[str]:
     ]
 
 
-def _brdf_rows(facts: dict[str, Any]) -> list[str]:
-    names, rows = facts.get("materials", []), []
+def _brdf_rows(facts: dict[str, Any]) -> Iterator[str]:
+    names = facts.get("materials", [])
     if facts["form"] == "scattered":
-        rows.append(f"scattered measurements, {facts['samples']} samples")
+        yield f"scattered measurements, {facts['samples']} samples"
     elif names:
-        rows.append(
-            f"BRDFs ({facts['form']}) of {len(names)} materials: {', '.join(names[:_NAMES])}"
-            f"{', ..' if len(names) > _NAMES else ''}"
-        )
-        rows += [f"model: {facts['model']}"] if "model" in facts else []
+        some = ", ".join(names[:_NAMES]) + (", .." if len(names) > _NAMES else "")
+        yield f"BRDFs ({facts['form']}) of {len(names)} materials: {some}"
     else:
-        rows.append(f"BRDF (MERL), {100 * facts['brdf']['filled']:.1f} % of its cells above the horizon filled")
-    return [*rows, f"use: --brdf {facts['use']}"] if facts["use"] else rows
+        yield f"BRDF (MERL), {100 * facts['brdf']['filled']:.1f} % of its cells above the horizon filled"
+    if "model" in facts:
+        yield f"model: {facts['model']}"
+    yield f"use: --brdf {facts['use']}"
 
 
 def _folder_rows(facts: dict[str, Any]) -> list[str]:
+    size = f"{facts['bytes']:,} bytes"
     if facts["kind"] == "folder":
-        return [f"folder of {len(facts['inside'])} objects and stores, {facts['bytes']:,} bytes"]
-    rows = f"{facts['kind']} of {facts['holds']}, {facts['bytes']:,} bytes"
-    return [f"{rows}, {facts['finished']} of {facts['blocks']} blocks are finished" if "blocks" in facts else rows]
+        return [f"folder of {len(facts['inside'])} objects and stores, {size}"]
+    finished = f", {facts['finished']} of {facts['blocks']} blocks are finished" if "blocks" in facts else ""
+    return [f"{facts['kind']} of {facts['holds']}, {size}{finished}"]

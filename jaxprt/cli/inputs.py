@@ -10,26 +10,25 @@ import inspect
 import itertools
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxprt import brdf
 from jaxprt.brdf import AshikhminShirley, Lambert
-from jaxprt.cli.report import View
 from jaxprt.relit import refinement, registry
-from jaxprt.scene import Environment, Part, Scene, TexturedMaterial, builtin, load_environment, load_scene
+from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial, builtin, load_environment, load_scene
 from jaxprt.scene import mesh as meshes
 from jaxprt.scene.camera import orbit
 from jaxprt.scene.environment import rotate
 from jaxprt.scene.formats.mesh_file import SUFFIXES
-from jaxprt.scene.scene import centered, default_camera, unique_names
-from jaxprt.scene.sides import two_sided
+from jaxprt.scene.scene import default_camera, unique_names
 
 # Loader of each kind of file, and its further options: True for required ones.
 FILES: dict[str, tuple[Callable, dict[str, bool]]] = {
@@ -48,7 +47,7 @@ UPRIGHT = {
 }
 LIGHTS = (".exr", ".hdr", ".pic")
 _LIGHT_STARTS = (b"\x76\x2f\x31\x01", b"#?RADIANCE", b"#?RGBE")
-_SIZE = 64
+LIGHT_SIZE = 64  # texels along the edge of the faces of lights by default
 _PLASTIC = TexturedMaterial(base_color=(0.4, 0.1, 0.08), metallic=0.0, roughness=0.4)
 
 
@@ -62,20 +61,27 @@ def parse(text: str) -> Callable | TexturedMaterial:
     if name not in models:
         names = ", ".join(dict.fromkeys([*models, *FILES]))
         raise ValueError(f"a material must be one of {names}, got {name!r}")
-    kind, arguments = models[name], {}
     known = parameters(name)
+    texts = _assigned(name, words, known, ", ".join(f"{parameter}=" for parameter in known))
+    arguments = {key: _numbers(name, key, value) for key, value in texts.items()}
+    missing = [f"{key}=" for key, default in known.items() if default is None and key not in arguments]
+    if missing:
+        raise ValueError(f"{name} must have {', '.join(missing)}, got {text!r}")
+    return models[name](**arguments)
+
+
+def _assigned(name: str, words: Sequence[str], known: Collection[str], form: str) -> dict[str, str]:
+    """The values of words KEY=VALUE by their keys."""
+    result: dict[str, str] = {}
     for word in words:
         key, equals, value = word.partition("=")
         key = _ALIASES.get(key, key) if "along" in known else key
         if not equals or key not in known:
-            raise ValueError(f"{name} takes {', '.join(f'{parameter}=' for parameter in known)}, got {word!r}")
-        if key in arguments:
+            raise ValueError(f"{name} takes {form}, got {word!r}")
+        if key in result:
             raise ValueError(f"{name} takes each parameter once, got {key} twice")
-        arguments[key] = _numbers(name, key, value)
-    missing = [key for key, default in known.items() if default is None and key not in arguments]
-    if missing:
-        raise ValueError(f"{name} must have {', '.join(f'{parameter}=' for parameter in missing)}, got {text!r}")
-    return kind(**arguments)
+        result[key] = value
+    return result
 
 
 def parameters(name: str) -> dict[str, float | None]:
@@ -117,16 +123,11 @@ def _load_measured(name: str, words: list[str]) -> Callable:
     load, takes = FILES[name]
     if not words or "=" in words[0]:
         raise ValueError(f"{name} must name a file, {form(name)}, got {', '.join(words) or 'none'}")
-    arguments: dict[str, Any] = {}
-    for word in words[1:]:
-        key, equals, value = word.partition("=")
-        if not equals or key not in takes or key in arguments:
-            raise ValueError(f"{name} takes {form(name)}, got {word!r}")
-        arguments[key] = _material_number(name, key, value) if key == "smoothing" else value
-    if any(needed and key not in arguments for key, needed in takes.items()):
-        # A name that no file has, so that the loader's error message lists existing ones.
-        arguments["material"] = ""
-    return load(Path(words[0]), **arguments)
+    arguments: dict[str, Any] = _assigned(name, words[1:], takes, form(name))
+    if "smoothing" in arguments:
+        arguments["smoothing"] = _material_number(name, "smoothing", arguments["smoothing"])
+    # A name that no file has makes the loader's error message list existing ones.
+    return load(Path(words[0]), **{key: "" for key, needed in takes.items() if needed} | arguments)
 
 
 def form(name: str) -> str:
@@ -183,54 +184,71 @@ def split_files(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     ]
 
 
-def check(options: SimpleNamespace) -> None:
-    """Refuses options that do not fit the files, before files are read.
+def check(files: Sequence[Path], *, ground: bool = False, light_size: int | None = None) -> list[Path]:
+    """Refuses options that do not fit the files, before files are read. Returns the meshes among the files.
 
     Raises:
         ValueError: A file is neither a mesh nor an environment, a ground is requested without a mesh, or the size of
             the light is not a power of two.
     """
-    _meshes(options)
-    _light_size(options, _SIZE)
-
-
-def _meshes(options: SimpleNamespace) -> list[Path]:
-    """The files that are meshes."""
-    paths, _ = split_files(options.files)
-    if not paths and options.ground:
+    paths, _ = split_files(files)
+    if not paths and ground:
         raise ValueError("--ground needs a mesh: the embedded scene has a board")
+    if light_size and light_size & (light_size - 1):
+        raise ValueError(f"--light-size must be a power of two, got {light_size}")
     return paths
 
 
-def _light_size(options: SimpleNamespace, size: int) -> int:
-    """Texels along the edge of the faces of lights."""
-    size = options.light_size or size
-    if size & (size - 1):
-        raise ValueError(f"--light-size must be a power of two, got {size}")
-    return size
-
-
-def scene(options: SimpleNamespace, *, playable: bool = False) -> Scene:
+def scene(
+    files: Sequence[Path],
+    *,
+    up: str = "y",
+    ground: bool = False,
+    refine: bool | float = True,
+    outside: bool = False,
+    brdf: Any = None,
+    material: Sequence[tuple[str, Any]] = (),
+    playable: bool = False,
+) -> Scene:
     """The upright scene of the files, with the requested materials. Without meshes it is the embedded scene.
 
     Args:
-        options: Object with `files`, `outside`, `up`, `ground`, `brdf`, `material` and `refine`.
+        files: Files, of which environments do not count.
+        up: Axis of the meshes that points up.
+        ground: Stand the meshes on a diffuse ground plane.
+        refine: Divide the meshes of files until interpolated visibility errs by E in pictures.  [default: 0.015]
+        outside: Let scenes read files outside of their folders.
+        brdf: Material of all meshes instead of the files' own, such as ward:along=.1,across=.3 or merl:FILE.
+        material: Material of one part, given by its name or its number from 0; may be given several times.
         playable: Whether to make materials changeable for the viewer. Parts without a material become plastic.
 
     Raises:
         ValueError: A file is not a scene, a ground is requested without a mesh, or a part does not exist.
     """
-    paths = _meshes(options)
-    result = _load_scenes(paths, options, playable) if paths else example_scene(brdf=options.brdf, playable=playable)
-    parts = list(result.parts)
-    for name, material in options.material:
-        number = _number([part.name for part in parts], name)
-        parts[number] = dataclasses.replace(parts[number], material=material)
-    result = dataclasses.replace(result, parts=parts)
+    paths = check(files, ground=ground)
     if not paths:  # The embedded scene has as many vertices as it needs.
-        return result
-    options_ = {"vertices": None, "environments": None, "folder": None, "progress": sys.stderr.isatty()}
-    return refinement.divided(result, options.refine, **options_)[0]
+        return _with_materials(example_scene(brdf=brdf, playable=playable), material)
+    turn, scenes = np.array(UPRIGHT[up]), [load_scene(path, outside=outside) for path in paths]
+    parts = [part for loaded in scenes for part in loaded.parts]
+    if up != "y":
+        parts = [eqx.tree_at(lambda p: p.mesh, part, meshes.rotate(part.mesh, turn)) for part in parts]
+    if playable:
+        parts = [_playable(part) for part in parts]
+    if brdf is not None:  # vertex colors belong to the file's material
+        parts = [Part(part.name, part.mesh, brdf) for part in parts]
+    cameras = scenes[0].cameras if up == "y" else ()
+    lamps = [lamp for loaded in scenes for lamp in loaded.point_lights if up == "y"]
+    names = unique_names([part.name for part in parts])
+    parts = [dataclasses.replace(part, name=name) for part, name in zip(parts, names, strict=True)]
+    if ground:
+        alone, matte = Scene(parts), _matte if playable else Lambert
+        parts.append(Part(unique_names([*names, "ground"])[-1], meshes.ground_plane(alone.mesh), matte(0.5)))
+        cameras = cameras or [default_camera(alone, alone.mesh)]  # of the object, which the ground is wider than
+    names = unique_names([*(part.name for part in parts), *(lamp.name for lamp in lamps)])[len(parts) :]
+    lamps = [dataclasses.replace(lamp, name=name) for lamp, name in zip(lamps, names, strict=True)]
+    result = _with_materials(Scene(parts, cameras, point_lights=lamps), material)
+    progress = sys.stderr.isatty()
+    return refinement.divided(result, refine, vertices=None, environments=None, folder=None, progress=progress)[0]
 
 
 def example_scene(*, brdf: Any = None, playable: bool = False) -> Scene:
@@ -246,24 +264,25 @@ def example_scene(*, brdf: Any = None, playable: bool = False) -> Scene:
     )
 
 
-def lights(options: SimpleNamespace, *, size: int = _SIZE) -> dict[str, Environment]:
+def lights(
+    files: Sequence[Path], *, turn: Sequence[float] = (0.0,), light_size: int | None = None
+) -> dict[str, Environment]:
     """Rotated lights by the names of their files, or the two embedded lights.
 
     Args:
-        options: Object with `files`, `turn` and `light_size`.
-        size: Texels along a face's edge if `light_size` is None.
+        files: Files, of which meshes do not count.
+        turn: Rotate each light by each angle about the vertical, counterclockwise as seen from above.
+        light_size: Texels along the edge of the light's cubemap faces, a power of two. If None, 64.
     """
-    _, paths = split_files(options.files)
-    size = _light_size(options, size)
+    size, (_, paths) = light_size or LIGHT_SIZE, split_files(files)
+    check((), light_size=size)
+    environments = {"daylight": builtin.daylight, "studio": builtin.studio}
     if paths:
         names = unique([path.stem for path in paths])
-        environments = {name: load_environment(path, size=size) for name, path in zip(names, paths, strict=True)}
-    else:
-        environments = {"daylight": builtin.daylight(size=size), "studio": builtin.studio(size=size)}
-    angles = options.turn
-    if len(angles) == 1:
-        return {name: rotate_light(light, angles[0]) for name, light in environments.items()}
-    return {f"{name}_{angle:g}": rotate_light(light, angle) for name, light in environments.items() for angle in angles}
+        environments = {name: partial(load_environment, path) for name, path in zip(names, paths, strict=True)}
+    loaded = {name: load(size=size) for name, load in environments.items()}
+    names = {angle: f"_{angle:g}" if len(turn) > 1 else "" for angle in turn}
+    return {name + names[angle]: rotate_light(light, angle) for name, light in loaded.items() for angle in turn}
 
 
 def unique(names: Sequence[str]) -> list[str]:
@@ -277,64 +296,38 @@ def unique(names: Sequence[str]) -> list[str]:
 
 def rotate_light(light: Environment, degrees: float) -> Environment:
     """A light rotated about the vertical, counterclockwise as seen from above."""
-    if degrees % 360 == 0:
-        return light
-    return rotate(light, about(float(np.radians(degrees))))
+    return light if degrees % 360 == 0 else rotate(light, about(float(np.radians(degrees))))
 
 
-def about(angle: float) -> Any:
+def about(angle: float) -> Float[Array, "3 3"]:
     """Rotation matrix about the vertical by an angle in radians, from +z towards +x."""
     c, s = np.cos(angle), np.sin(angle)
     return jnp.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]], jnp.result_type(float))
 
 
-def view(options: SimpleNamespace, *, size: int = _SIZE) -> View:
-    """The scene, its lights, and a camera that sees everything except the ground."""
-    looked, lit = two_sided(centered(scene(options))), lights(options, size=size)
-    azimuth, elevation = np.radians([options.azimuth, options.elevation])
-    # The board of the embedded scene and the ground may extend beyond the picture.
-    alone = not split_files(options.files)[0]
-    shown = looked.parts[:1] if alone else looked.parts[:-1] if options.ground else looked.parts
-    edge = {"width": options.size, "height": options.size}
-    camera = orbit(Scene(shown).mesh, azimuth=azimuth, elevation=elevation, **edge)
-    return View(looked, lit, camera, tone=options.tone)
+def camera(parts: Sequence[Part], *, azimuth: float = 20.0, elevation: float = 15.0, size: int = 512) -> Camera:
+    """A camera that sees some parts of a scene.
+
+    Args:
+        parts: The parts.
+        azimuth: Azimuth of the camera, from +z towards +x.
+        elevation: Elevation of the camera above the horizon, from -90 to 90.
+        size: Width and height of the pictures in pixels.
+    """
+    azimuth, elevation = np.radians([azimuth, elevation])
+    return orbit(Scene(parts).mesh, azimuth=azimuth, elevation=elevation, width=size, height=size)
 
 
-def _load_scenes(paths: Sequence[Path], options: SimpleNamespace, playable: bool) -> Scene:
-    """The scenes of all files as one upright scene, with a ground if requested."""
-    turn = np.array(UPRIGHT[options.up])
-    scenes = [load_scene(path, outside=options.outside) for path in paths]
-    parts = [part for loaded in scenes for part in loaded.parts]
-    names = unique_names([part.name for part in parts])
-    if options.up != "y":
-        parts = [eqx.tree_at(lambda p: p.mesh, part, meshes.rotate(part.mesh, turn)) for part in parts]
-    if playable:
-        parts = [_playable(part) for part in parts]
-    if options.brdf is not None:  # vertex colors belong to the file's material
-        parts = [Part(part.name, part.mesh, options.brdf) for part in parts]
-    parts = [dataclasses.replace(part, name=name) for name, part in zip(names, parts, strict=True)]
-    cameras = scenes[0].cameras if options.up == "y" else []
-    if options.ground:
-        matte: Callable = _matte if playable else Lambert
-        name, alone = unique_names([*names, "ground"])[-1], Scene(parts)
-        parts.append(Part(name, meshes.ground_plane(alone.mesh), matte(0.5)))
-        cameras = cameras or [default_camera(alone, alone.mesh)]  # of the object, which the ground is wider than
-    if options.up != "y":
-        return Scene(parts, cameras)
-    lamps = [lamp for loaded in scenes for lamp in loaded.point_lights]
-    names = unique_names([*(part.name for part in parts), *(lamp.name for lamp in lamps)])[len(parts) :]
-    lamps = [dataclasses.replace(lamp, name=name) for name, lamp in zip(names, lamps, strict=True)]
-    return Scene(parts, cameras, point_lights=lamps)
-
-
-def _number(names: Sequence[str], name: str) -> int:
-    """The index of a part that is given by its name or index."""
-    if name in names:
-        return names.index(name)
-    if name.isdecimal() and int(name) < len(names):
-        return int(name)
-    known = ", ".join(f"{number} {label!r}" for number, label in enumerate(names))
-    raise ValueError(f"--material must name one of the parts {known}, got {name!r}")
+def _with_materials(scene: Scene, materials: Sequence[tuple[str, Any]]) -> Scene:
+    """The scene with other materials of parts, which are named or numbered."""
+    parts, names = list(scene.parts), scene.names
+    for name, material in materials:
+        if name not in names and not (name.isdecimal() and int(name) < len(names)):
+            known = ", ".join(f"{number} {label!r}" for number, label in enumerate(names))
+            raise ValueError(f"--material must name one of the parts {known}, got {name!r}")
+        number = names.index(name) if name in names else int(name)
+        parts[number] = dataclasses.replace(parts[number], material=material)
+    return dataclasses.replace(scene, parts=parts)
 
 
 def _playable(part: Part) -> Part:

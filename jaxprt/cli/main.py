@@ -4,6 +4,7 @@ import os
 import sys
 import threading
 import warnings
+from types import SimpleNamespace
 from typing import Any
 
 import click
@@ -14,14 +15,7 @@ import jaxprt
 from jaxprt.cli import dataset, export, info, inputs, measure, options, planned, play, relight
 from jaxprt.relit import registry
 
-_SHELLS = {"bash": "~/.bashrc", "zsh": "~/.zshrc", "fish": "~/.config/fish/completions/jaxprt.fish"}
 _INTERRUPTED = 130
-
-
-class Refused(click.ClickException):
-    """Error for wrong input. The message states what was required and what was given."""
-
-    exit_code = 2
 
 
 class Program(click.Group):
@@ -36,16 +30,16 @@ class Program(click.Group):
         warnings.showwarning = lambda message, *_, **__: click.echo(f"Warning: {message}", err=True)
         try:
             return super().invoke(ctx)
-        except BrokenPipeError:  # for example from `| head`
+        except (BrokenPipeError, click.exceptions.Exit, click.Abort):  # from `| head`, for example, and of click itself
             raise
         except KeyboardInterrupt:
             click.echo("jaxprt: stopped; the same command goes on from here", err=True)
             ctx.exit(_INTERRUPTED)
         except (ValueError, TypeError, FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
-            raise Refused(options.message_of(error)) from error
+            refused = click.ClickException(options.message_of(error))
+            refused.exit_code = 2
+            raise refused from error
         except (OSError, RuntimeError, MemoryError) as error:
-            if isinstance(error, click.exceptions.Exit | click.Abort):  # subclasses of RuntimeError
-                raise
             raise click.ClickException(options.message_of(error)) from error
 
 
@@ -59,7 +53,10 @@ Materials, for --brdf and --material:
 
 
 @click.group(
-    cls=Program, epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}
+    cls=Program,
+    commands=[module.command for module in (relight, play, planned, measure, export, dataset, info)],
+    epilog=_EPILOG,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
 )
 @click.version_option(jaxprt.__version__, "-V", "--version", prog_name="jaxprt")
 def program() -> None:
@@ -72,9 +69,12 @@ def program() -> None:
     """
 
 
-@click.command(cls=options.Command, short_help="Print the script for completion in bash, zsh or fish.")
-@click.argument("shell", type=click.Choice(list(_SHELLS)))
-def completion(shell: str) -> None:
+@options.command(
+    "completion",
+    "Print the script for completion in bash, zsh or fish.",
+    click.Argument(["shell"], type=click.Choice(("bash", "zsh", "fish"))),
+)
+def completion(chosen: SimpleNamespace) -> None:
     """Print the script with which a shell completes commands, options, materials and files.
 
     \b
@@ -83,23 +83,12 @@ def completion(shell: str) -> None:
       jaxprt completion zsh >> ~/.zshrc
       jaxprt completion fish > ~/.config/fish/completions/jaxprt.fish
     """  # noqa: D301
-    kind = get_completion_class(shell)
-    if kind is None:
-        raise click.UsageError(f"the shell must be one of {', '.join(_SHELLS)}, got {shell}")
-    click.echo(kind(program, {}, "jaxprt", "_JAXPRT_COMPLETE").source())
+    kind = get_completion_class(chosen.shell)
+    if kind is not None:
+        click.echo(kind(program, {}, "jaxprt", "_JAXPRT_COMPLETE").source())
 
 
-for _name, _command in {
-    "relight": relight.command,
-    "view": play.command,
-    "plan": planned.command,
-    "measure": measure.command,
-    "export": export.command,
-    "dataset": dataset.command,
-    "info": info.command,
-    "completion": completion,
-}.items():
-    program.add_command(_command, _name)
+program.add_command(completion)
 
 
 def run() -> None:

@@ -1,10 +1,16 @@
-"""Options that several commands share, in groups, and the output of results."""
+"""Options of commands, with the names, defaults and docstrings of the functions that the commands call; and results."""
 
+import collections
 import contextlib
+import dataclasses
+import inspect
+import itertools
 import json
 import math
+import os
+import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,147 +19,152 @@ import click
 from click.shell_completion import CompletionItem
 
 from jaxprt.cli import inputs
+from jaxprt.files import outputs
 from jaxprt.relit import Clusters, Dynamic, Harmonics, Lobes, Terms, registry
+from jaxprt.relit.build import precompute
 from jaxprt.relit.recipes import Recipe
+from jaxprt.scene import Environment
 
 LAPLACIAN = {"none": 1.0, "laplacian": 0.4}  # fraction of the squared Laplacian that each window preserves
-NAMES = ("lobe", "harmonic", "separable", "clusters", "dynamic")
-_COUNT = 12  # default number of lobes
-_TAKEN = {
-    "lobes": ("lobe", "dynamic"),
-    "texels": ("lobe", "clusters", "dynamic"),
-    "terms": ("separable", "clusters"),
-    "keep": ("separable", "clusters", "dynamic"),
-    "components": ("clusters", "dynamic"),
-    "modes": ("clusters", "dynamic"),
+RECIPES: dict[str, type[Recipe]] = {
+    "lobe": Lobes,
+    "harmonic": Harmonics,
+    "separable": Terms,
+    "clusters": Clusters,
+    "dynamic": Dynamic,
 }
-_PATH: Any = click.Path(path_type=Path)
+SHIPPED_LOBES = 8  # the smallest number whose tables are shipped; fewer lobes take less time per look
 
 
-def check(options: SimpleNamespace, systems: Sequence[str], texels: int) -> None:
-    """Refuses size options that none of the systems uses, or that exceed the size of the light.
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """What a command prints: a value as JSON, or a text; then it fails with an error if there is one."""
 
-    Raises:
-        ValueError: A size belongs to another system, or there are more wavelet coefficients than texels.
-    """
-    for name, takers in _TAKEN.items():
-        if getattr(options, name) is not None and not set(takers) & set(systems):
-            raise ValueError(f"--{name} needs --system {' or '.join(takers)}, got {','.join(systems)}")
-    if options.keep is not None and options.keep > texels:
-        raise ValueError(f"--keep must be at most {texels}, got {options.keep}")
-
-
-def recipes(system: str, options: SimpleNamespace, *, lobes: int = _COUNT) -> dict[str, Recipe]:
-    """The recipes for a system and the options, by names that are used for folders and files."""
-    if system == "lobe":
-        counts = options.lobes or (lobes,)
-        more = {} if options.texels is None else {"texels": options.texels}
-        names = [system] if len(counts) == 1 else [f"lobe_{count}" for count in counts]
-        return {name: Lobes(count, **more) for name, count in zip(names, counts, strict=True)}
-    if system == "harmonic":
-        return {system: Harmonics(options.order - 1, LAPLACIAN[options.window])}
-    if system == "dynamic":
-        return _dynamic(options)
-    if system not in NAMES:
-        return {system: registry.systems()[system]}
-    names = ("terms", "keep") if system == "separable" else ("terms", "keep", "components", "modes", "texels")
-    values = {name: value for name in names if (value := getattr(options, name)) is not None}
-    return {system: Terms(**values) if system == "separable" else Clusters(**values)}
-
-
-def _dynamic(options: SimpleNamespace) -> dict[str, Recipe]:
-    """Recipes of the dynamic system. Other numbers of lobes than by default have no tensor."""
-    names = ("keep", "components", "modes", "texels")
-    values = {name: value for name in names if (value := getattr(options, name, None)) is not None}
-    counts, whole = options.lobes or (), Dynamic(**values)
-    if not counts:
-        return {"dynamic": whole}
-    names = ["dynamic"] if len(counts) == 1 else [f"dynamic_{count}" for count in counts]
-    ranks = [whole.ranks if count == whole.lobes else None for count in counts]
-    rows = zip(names, counts, ranks, strict=True)
-    return {name: Dynamic(lobes=count, ranks=rank, **values) for name, count, rank in rows}
+    value: Any
+    text: str
+    error: Exception | None = None
 
 
 class Command(click.Command):
     """A command whose help lists options in groups."""
 
+    groups: dict[str, list[click.Option]]
+
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Writes a section for each group, in the order of the options."""
-        groups: dict[str, list[tuple[str, str]]] = {}
-        for parameter in self.get_params(ctx):
-            record = parameter.get_help_record(ctx) if isinstance(parameter, click.Option) else None
-            if record is not None:
-                groups.setdefault(getattr(parameter, "group", "Options"), []).append(record)
-        for name, records in groups.items():
+        """Writes a section for each group."""
+        for name, members in (self.groups | {"Options": [self.get_help_option(ctx)]}).items():
             with formatter.section(name):
-                formatter.write_dl(records)
+                formatter.write_dl([record for member in members if member and (record := member.get_help_record(ctx))])
 
 
-class Option(click.Option):
-    """An option that belongs to a group."""
+def command(
+    name: str, short_help: str, *arguments: click.Argument, **groups: list[Any]
+) -> Callable[[Callable], Command]:
+    """A decorator that makes a command of a function from options to a result, which the command prints.
 
-    def __init__(self, *names: Any, group: str = "Options", **more: Any):
-        """Takes the group in addition to click's arguments."""
-        super().__init__(*names, **more)
-        self.group = group
+    Args:
+        name: Its name.
+        short_help: Its line in the list of commands.
+        arguments: What is given without the name of an option.
+        groups: Options by the title of their section in the help; in place of some, a dictionary from their names to
+            the type and the default. The function's docstring then describes them.
+    """
 
+    def decorate(function: Callable[[SimpleNamespace], Result | None]) -> Command:
+        def run(**values: Any) -> None:
+            as_json = values.get("json", False)
+            with contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext():
+                result = function(SimpleNamespace(**values))
+            if result is not None:
+                click.echo(json.dumps(finite(result.value), indent=2, allow_nan=False) if as_json else result.text)
+                if result.error is not None:
+                    raise result.error
 
-class Finite(click.ParamType):
-    """A finite number in a range."""
+        words, members = described(function), {}
+        for title, group in groups.items():
+            members[title] = [
+                option(key, words[key], *value) if key else value
+                for member in group
+                for key, value in (member if isinstance(member, dict) else {"": member}).items()
+            ]
+        text, _, _ = (inspect.getdoc(function) or "").partition("\n\nOptions:\n")
+        parameters = [*arguments, *itertools.chain(*members.values())]
+        result = Command(name, callback=run, params=parameters, help=text, short_help=short_help)
+        result.groups = members
+        return result
 
-    name = "number"
-
-    def __init__(self, least: float | None = None, most: float | None = None, *, open: bool = False):
-        """Takes the ends of the range. With `open` the ends are excluded."""
-        self._ends, self._open = (least, most), open
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Parses the number."""
-        number = _parse_number(float, value)
-        if number is None or not math.isfinite(number) or not _inside(number, *self._ends, open=self._open):
-            self.fail(
-                _requirement("a finite number", *self._ends, open=self._open, number=number, value=value), param, ctx
-            )
-        return number
-
-
-class Whole(click.IntRange):
-    """A whole number in a range."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Parses the number."""
-        number = _parse_number(int, value)
-        if number is None or not _inside(number, self.min, self.max, open=False):
-            self.fail(
-                _requirement("a whole number", self.min, self.max, open=False, number=number, value=value), param, ctx
-            )
-        return number
+    return decorate
 
 
-def _parse_number(kind: Callable, value: Any) -> Any:
-    """The value as a number; None if it is none."""
-    try:
-        return kind(value)
-    except ValueError:
-        return None
+def call(function: Callable, chosen: SimpleNamespace, **more: Any) -> Any:
+    """The result of a function whose parameters are options, for the chosen values and others that are given here."""
+    known = inspect.signature(function).parameters
+    return function(**{name: value for name, value in vars(chosen).items() if name in known} | more)
 
 
-def _inside(number: int | float, least: int | float | None, most: int | float | None, *, open: bool) -> bool:
-    if open and number in (least, most):
-        return False
-    return (least is None or least <= number) and (most is None or number <= most)
+def option(name: str, words: str, kind: Any = None, default: Any = None) -> click.Option:
+    """An option whose help shows its default and its range. One whose default is () may be given several times."""
+    names = [f"--{name.replace('_', '-')}", name]
+    if kind is bool:
+        return click.Option(names, is_flag=True, help=words)
+    item = kind.item if isinstance(kind, Several) else kind
+    if isinstance(item, Range) and item.limits:
+        words += f"  [{item.limits.removeprefix('of ')}]"
+    shown = default is not None and default is not True and default != ()
+    more = {"show_default": shown, "multiple": default == ()}
+    return click.Option(names, type=kind, default=default, help=words, **more)
 
 
-def _requirement(
-    what: str, least: int | float | None, most: int | float | None, *, open: bool, number: Any, value: Any
-) -> str:
-    """The message for a value that is not such a number, or not in the range."""
-    low = "" if least is None else f" {'above' if open else 'of at least'} {least:g}"
-    high = "" if most is None else f" {'below' if open else 'of at most'} {most:g}"
-    both = f"{low} and{high}" if low and high else low + high
-    if low and high and not open:
-        both = f" from {least:g} to {most:g}"
-    return f"must be {what}{both}, got {repr(value) if number is None else value}"
+def described(documented: Any) -> collections.defaultdict[str, str]:
+    """The first sentence of a docstring on each argument or attribute, with what it says of None as the default."""
+    # `python -OO` leaves docstrings out.
+    entries = re.findall(r"^    (\w+): (.*(?:\n        .*)*)", inspect.getdoc(documented) or "", re.MULTILINE)
+    result = collections.defaultdict(str)
+    for name, text in entries:
+        sentences = re.split(r"(?<=\.) +(?=[A-Z])", " ".join(text.split()))
+        defaults = [sentence[len("If None, ") : -1] for sentence in sentences if sentence.startswith("If None, ")]
+        result[name] = sentences[0] + "".join(f"  [default: {default}]" for default in defaults)
+    return result
+
+
+def options_of(function: Callable, **kinds: Any) -> list[click.Option]:
+    """Options for parameters of a function, by the types of their values; all else is the function's."""
+    words, known = described(function), inspect.signature(function).parameters
+    return [option(name, words[name], kind, known[name].default) for name, kind in kinds.items()]
+
+
+class Range(click.ParamType):
+    """A finite number in a range, or a word that stands for a value."""
+
+    def __init__(
+        self,
+        low: int | float = -math.inf,
+        high: int | float = math.inf,
+        *,
+        kind: type = int,
+        open: bool = False,
+        name: str = "N",
+        **words: Any,
+    ):
+        """Takes the ends, `int` or `float`, whether the ends are excluded, the name in the help, and the words."""
+        self._low, self._high, self._kind, self._open, self.name, self._words = low, high, kind, open, name, words
+        least, most = f"{'above' if open else 'of at least'} {low:g}", f"{'below' if open else 'of at most'} {high:g}"
+        ends = [text for end, text in ((low, least), (high, most)) if math.isfinite(end)]
+        self.limits = f"from {low:g} to {high:g}" if len(ends) == 2 and not open else " and ".join(ends)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Parses the number or the word."""
+        if not isinstance(value, str) or value in self._words:
+            return self._words.get(value, value)
+        number = None
+        with contextlib.suppress(ValueError):
+            number = self._kind(value)
+            inside = self._low <= number <= self._high and abs(number) < math.inf
+            if inside and not (self._open and number in (self._low, self._high)):
+                return number
+        what = " ".join(["a whole number" if self._kind is int else "a finite number", self.limits]).strip()
+        words = "".join(f', or "{word}"' for word in self._words)
+        self.fail(f"must be {what}{words}, got {repr(value) if number is None else value}", param, ctx)
 
 
 class Several(click.ParamType):
@@ -166,7 +177,7 @@ class Several(click.ParamType):
     def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
         """The name of the values in help and usage."""
         choices = getattr(self.item, "choices", None)
-        return f"[{'|'.join(choices)}],.." if choices else "N,.."
+        return f"[{'|'.join(choices)}],.." if choices else f"{self.name.upper()},.."
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple:
         """Parses the values and removes duplicates."""
@@ -177,51 +188,26 @@ class Several(click.ParamType):
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
         """Completes the last value."""
         before, comma, last = incomplete.rpartition(",")
-        return [
-            CompletionItem(f"{before}{comma}{completion.value}", completion.type, completion.help)
-            for completion in self.item.shell_complete(ctx, param, last)
-        ]
-
-
-class Bounces(click.ParamType):
-    """The number of bounces: an integer, or "all"."""
-
-    name = "N|all"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
-        """Parses the number or "all"."""
-        if value != "all" and not str(value).isdecimal():
-            self.fail(f'must be a whole number of at least 0, or "all", got {value!r}', param, ctx)
-        return value if value == "all" else int(value)
-
-
-class Refinement(click.ParamType):
-    """The error to which meshes are divided, or "off"."""
-
-    name = "E|off"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | bool:
-        """Parses the error; "off" gives False."""
-        if isinstance(value, bool) or value == "off":
-            return bool(value) and value != "off"
-        try:
-            error = float(value)
-        except ValueError:
-            error = float("nan")
-        if not 0 <= error < float("inf"):
-            self.fail(f'must be an error of at least 0, such as 0.02, or "off", got {value!r}', param, ctx)
-        return error
+        items = self.item.shell_complete(ctx, param, last)
+        return [CompletionItem(f"{before}{comma}{item.value}", item.type, item.help) for item in items]
 
 
 class Material(click.ParamType):
-    """A material, given by a model and its parameters, or by a file."""
+    """A material, given by a model and its parameters, or by a file; that of a part as PART=MATERIAL."""
 
-    name = "material"
+    def __init__(self, *, of_part: bool = False):
+        """Takes whether the value names a part."""
+        self._of_part, self.name = of_part, "part=material" if of_part else "material"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Parses the material."""
+        if not isinstance(value, str):
+            return value
         try:
-            return inputs.parse(value) if isinstance(value, str) else value
+            if not self._of_part:
+                return inputs.parse(value)
+            part, material = inputs.of_part(value)
+            return part, inputs.parse(material)
         except (ValueError, OSError) as error:
             self.fail(message_of(error), param, ctx)
 
@@ -233,25 +219,139 @@ class Material(click.ParamType):
             return [CompletionItem(f"{known}:") for known in names if known.startswith(name)]
         before, comma, last = rest.rpartition(",")
         known = inputs.parameters(name) if name in registry.materials() else {}
-        return [
-            CompletionItem(f"{name}:{before}{comma}{parameter}=") for parameter in known if parameter.startswith(last)
-        ]
+        return [CompletionItem(f"{name}:{before}{comma}{key}=") for key in known if key.startswith(last)]
 
 
-class OfPart(Material):
-    """A material for a part: PART=MATERIAL."""
+class SystemName(click.Choice):
+    """Names of systems: some of jaxprt's, and those of other packages."""
 
-    name = "part=material"
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """All names."""
+        return (*self._names, *(name for name in registry.systems() if name not in RECIPES))
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Parses the part and its material."""
-        if not isinstance(value, str):
-            return value
-        try:
-            part, material = inputs.of_part(value)
-        except ValueError as error:
-            self.fail(str(error), param, ctx)
-        return part, super().convert(material, param, ctx)
+    @choices.setter
+    def choices(self, names: tuple[str, ...]) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        self._names = names
+
+
+FRACTION = Range(0.0, 1.0, kind=float, open=True, name="E")
+DEGREES = Range(kind=float, name="degrees")
+ELEVATION = Range(-90.0, 90.0, kind=float, name="degrees")
+PIXELS = Range(1, 8192)
+BOUNCES = Range(0, name="N|all", all="all")
+REFINE = Range(0.0, kind=float, name="E|off", off=False)
+_SIZES: dict[str, click.ParamType] = {"lobes": Several(Range(1, 64)), "texels": Range(0)}
+_SIZES |= dict.fromkeys(("terms", "keep", "components", "modes"), Range(1))
+
+FILES = click.Argument(["files"], metavar="[FILE]...", type=click.Path(exists=True, path_type=Path), nargs=-1)
+SCENE = options_of(
+    inputs.scene,
+    up=click.Choice(list(inputs.UPRIGHT)),
+    ground=bool,
+    refine=REFINE,
+    outside=bool,
+    brdf=Material(),
+    material=Material(of_part=True),
+)
+LIGHT_SIZE = options_of(inputs.lights, light_size=Range(1, 1024))
+LIGHT = [*options_of(inputs.lights, turn=Several(DEGREES)), *LIGHT_SIZE]
+JSON = option("json", "Print the result as JSON on stdout.", bool)
+PLAN = options_of(precompute, error=FRACTION, bounces=BOUNCES)
+NO_BOUNCES = option("bounces", described(precompute)["bounces"].partition("  [")[0], BOUNCES, 0)
+PLANNED = ("planned", *RECIPES)
+
+
+def systems(names: Sequence[str], words: str, default: str | None = "lobe") -> click.Option:
+    """The option --system."""
+    return option("system", words, Several(SystemName(names)), default and (default,))
+
+
+def layers(words: str) -> click.Option:
+    """The option --layers."""
+    return option("layers", words, Several(click.Choice(list(outputs.LAYERS))))
+
+
+def folder(words: str, *, default: str | None = None) -> click.Option:
+    """The option --output for a folder."""
+    return option("output", words, click.Path(path_type=Path), default)
+
+
+def _defaults(size: str, lobes: int) -> dict[str, int]:
+    """The systems that have a size, with its default values."""
+    values = {name: getattr(recipe(), size, None) for name, recipe in RECIPES.items()}
+    if size == "lobes":
+        values["lobe"] = lobes
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def sizes(*names: str, lobes: int = Lobes().lobes) -> list[click.Option]:
+    """Options for some sizes of systems, or all, as their recipes describe them."""
+    result = []
+    for name in names or _SIZES:
+        words: dict[str, list[str]] = {}
+        for system, value in _defaults(name, lobes).items():
+            words.setdefault(re.split("[;.]", described(RECIPES[system])[name])[0], []).append(f"{system} {value}")
+        text = "; ".join(f"{sentence} [default: {', '.join(values)}]" for sentence, values in words.items())
+        text += "; several numbers make several systems" * (name == "lobes")
+        result.append(option(name, text, _SIZES[name]))
+    order = option("order", "Bands of spherical harmonics (harmonic); N^2 coefficients.", Range(1, 15), 5)
+    window = "Window against ringing on glossy parts (harmonic)."
+    return [*result, order, option("window", window, click.Choice(list(LAPLACIAN)), "laplacian")]
+
+
+FEW_SIZES = sizes("lobes", "texels", lobes=SHIPPED_LOBES)  # of systems that pages show
+
+
+def check(chosen: SimpleNamespace, systems: Sequence[str], light: Environment) -> None:
+    """Refuses size options that none of the systems uses, or that exceed the size of the light.
+
+    Raises:
+        ValueError: A size belongs to another system, or there are more wavelet coefficients than texels.
+    """
+    for name in _SIZES:
+        takers = _defaults(name, 0)
+        if getattr(chosen, name) is not None and not set(takers) & set(systems):
+            raise ValueError(f"--{name} needs --system {' or '.join(takers)}, got {','.join(systems)}")
+    texels = 6 * light.radiance.shape[-2] ** 2
+    if chosen.keep is not None and chosen.keep > texels:
+        raise ValueError(f"--keep must be at most {texels}, got {chosen.keep}")
+
+
+def recipes(system: str, chosen: SimpleNamespace, *, lobes: int = Lobes().lobes) -> dict[str, Recipe]:
+    """The recipes for a system and the options, by names that are used for folders and files."""
+    if system not in RECIPES:
+        return {system: registry.systems()[system]}
+    if system == "harmonic":
+        return {system: Harmonics(chosen.order - 1, LAPLACIAN[chosen.window])}
+    recipe, sizes = RECIPES[system], {name: getattr(chosen, name, None) for name in _SIZES if name != "lobes"}
+    values = {name: value for name, value in sizes.items() if value is not None and hasattr(recipe(), name)}
+    if system not in _defaults("lobes", lobes):
+        return {system: recipe(**values)}
+    counts = chosen.lobes or (_defaults("lobes", lobes)[system],)
+    names = [system] if len(counts) == 1 else [f"{system}_{count}" for count in counts]
+    # Tensors are shipped for the default number of lobes.
+    without = {count: {"ranks": None} if system == "dynamic" and count != Dynamic().lobes else {} for count in counts}
+    return {name: recipe(lobes=count, **without[count], **values) for name, count in zip(names, counts, strict=True)}
+
+
+def recipe(chosen: SimpleNamespace, what: str) -> Recipe:
+    """The recipe of a command that takes one system and one size of it."""
+    if len(chosen.system) > 1 or len(chosen.lobes or ()) > 1:
+        raise ValueError(f"{what} takes one system and one number of lobes, got several")
+    return next(iter(recipes(chosen.system[0], chosen, lobes=SHIPPED_LOBES).values()))
+
+
+def make_folder(path: Path | None, *, name: str = "--output") -> None:
+    """Creates the folder of the option `name`, if it is given, before anything is computed."""
+    if path is None:
+        return
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"{name} must be a folder that can be made, got {path}: {error.strerror}") from error
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise ValueError(f"{name} must be a folder that can be written to, got {path}")
 
 
 def message_of(error: Exception) -> str:
@@ -261,223 +361,10 @@ def message_of(error: Exception) -> str:
     return str(error)
 
 
-def option(*names: str, group: str, **more: Any) -> Callable:
-    """A decorator that adds an option to a command, in a group."""
-    return click.option(*names, cls=Option, group=group, **more)
-
-
-def together(*decorators: Callable) -> Callable:
-    """Combines several decorators. The first is outermost."""
-
-    def decorate(function: Callable) -> Callable:
-        for decorator in reversed(decorators):
-            function = decorator(function)
-        return function
-
-    return decorate
-
-
-outside = option("--outside", group="Scene", is_flag=True, help="Let scenes read files outside of their folders.")
-scene = together(
-    click.argument("files", metavar="[FILE]...", type=click.Path(exists=True, path_type=Path), nargs=-1),
-    option(
-        "--up",
-        group="Scene",
-        type=click.Choice(list(inputs.UPRIGHT)),
-        default="y",
-        show_default=True,
-        help="Axis of the meshes that points up.",
-    ),
-    option("--ground", group="Scene", is_flag=True, help="Stand the meshes on a diffuse ground plane."),
-    option(
-        "--refine",
-        group="Scene",
-        type=Refinement(),
-        default=True,
-        metavar="E|off",
-        help="Divide the meshes of files until interpolated visibility errs by E in pictures.  [default: 0.015]",
-    ),
-    outside,
-    option(
-        "--brdf",
-        group="Scene",
-        type=Material(),
-        metavar="MATERIAL",
-        help="Material of all meshes instead of the files' own, such as ward:along=.1,across=.3 or merl:FILE.",
-    ),
-    option(
-        "--material",
-        group="Scene",
-        type=OfPart(),
-        multiple=True,
-        metavar="PART=MATERIAL",
-        help="Material of one part, given by its name or its number from 0.",
-    ),
-)
-light_size = option(
-    "--light-size",
-    group="Light",
-    type=Whole(1, 1024),
-    metavar="N",
-    help="Texels along the edge of the light's cubemap faces, a power of two.  [default: 64]",
-)
-light = together(
-    option(
-        "--turn",
-        group="Light",
-        type=Several(Finite()),
-        default="0",
-        metavar="DEGREES,..",
-        help="Rotate each light by each angle about the vertical, counterclockwise as seen from above.",
-    ),
-    light_size,
-)
-camera = together(
-    option(
-        "--azimuth",
-        group="Camera",
-        type=Finite(),
-        default=20.0,
-        metavar="DEGREES",
-        show_default=True,
-        help="Azimuth of the camera, from +z towards +x.",
-    ),
-    option(
-        "--elevation",
-        group="Camera",
-        type=Finite(-90.0, 90.0),
-        default=15.0,
-        metavar="DEGREES",
-        show_default=True,
-        help="Elevation of the camera above the horizon, from -90 to 90.",
-    ),
-    option(
-        "--size",
-        group="Camera",
-        type=Whole(1, 8192),
-        metavar="N",
-        default=512,
-        show_default=True,
-        help="Width and height of the pictures in pixels.",
-    ),
-)
-few_sizes = together(
-    option(
-        "--lobes",
-        group="Sizes",
-        type=Several(Whole(1, 64)),
-        metavar="N,..",
-        help="Lobes per BRDF (lobe, dynamic). Several numbers make several systems.  [default: 12]",
-    ),
-    option(
-        "--texels",
-        group="Sizes",
-        type=Whole(0),
-        metavar="N",
-        help="Brightest texels that are summed one by one (lobe, clusters, dynamic).  [default: 16]",
-    ),
-    option(
-        "--order",
-        group="Sizes",
-        type=Whole(1, 15),
-        metavar="N",
-        default=5,
-        show_default=True,
-        help="Bands of spherical harmonics (harmonic); N^2 coefficients.",
-    ),
-    option(
-        "--window",
-        group="Sizes",
-        type=click.Choice(list(LAPLACIAN)),
-        default="laplacian",
-        show_default=True,
-        help="Window against ringing on glossy parts (harmonic).",
-    ),
-)
-_more_sizes = together(
-    option(
-        "--terms",
-        group="Sizes",
-        type=Whole(1),
-        metavar="N",
-        help="BRDF terms.  [default: 4 for separable, 32 for clusters]",
-    ),
-    option(
-        "--keep",
-        group="Sizes",
-        type=Whole(1),
-        metavar="N",
-        help="Wavelet coefficients.  [default: 96 per vertex and term for separable, 768 per cluster for clusters, "
-        "1024 for dynamic]",
-    ),
-    option(
-        "--components",
-        group="Sizes",
-        type=Whole(1),
-        metavar="N",
-        help="Principal components along the vertices of each cluster.  [default: 16 for clusters, 24 for dynamic]",
-    ),
-    option(
-        "--modes",
-        group="Sizes",
-        type=Whole(1),
-        metavar="N",
-        help="Principal components along the light of each cluster.  [default: 80 for clusters, 128 for dynamic]",
-    ),
-)
-recipe = together(few_sizes, _more_sizes)
-bounces = option("--bounces", group="System", type=Bounces(), help='Number of bounces between parts, or "all".')
-no_bounces = option(
-    "--bounces",
-    group="System",
-    type=Bounces(),
-    default="0",
-    help='Number of bounces between parts, or "all".  [default: 0]',
-)
-as_json = option("--json", "as_json", group="Output", is_flag=True, help="Print the result as JSON on stdout.")
-
-
-class SystemName(click.Choice):
-    """Names of systems: some of jaxprt's, and those of other packages."""
-
-    @property
-    def choices(self) -> tuple[str, ...]:
-        """All names."""
-        return (*self._names, *(name for name in registry.systems() if name not in NAMES))
-
-    @choices.setter
-    def choices(self, names: tuple[str, ...]) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        self._names = names
-
-
-def systems(names: Sequence[str], *, default: str | None, words: str) -> Callable:
-    """The option --system."""
-    return option("--system", group="System", type=Several(SystemName(names)), default=default, help=words)
-
-
-def folder(words: str, *, default: str | None = None) -> Callable:
-    """The option --output for a folder."""
-    shown: Any = default is not None
-    return option("--output", group="Output", type=_PATH, default=default, show_default=shown, help=words)
-
-
-@contextlib.contextmanager
-def reserve_stdout(result: bool) -> Iterator[None]:
-    """Redirects other output to stderr if stdout is reserved for the result as JSON."""
-    if not result:
-        yield
-        return
-    with contextlib.redirect_stdout(sys.stderr):
-        yield
-
-
-def tell(result: Any, text: str, *, as_json: bool) -> None:
-    """Prints a result as JSON or as text."""
-    click.echo(json.dumps(finite(result), indent=2, allow_nan=False) if as_json else text)
-
-
 def finite(value: Any) -> Any:
-    """A value that JSON can represent. Numbers that are not finite become null."""
+    """A value that JSON can represent: arrays become lists, and numbers that are not finite null."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
     if isinstance(value, dict):
         return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,39 +1,31 @@
 """The command `jaxprt plan`: chooses systems and sizes for a scene."""
 
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import click
-
-from jaxprt.cli import inputs, options, relight
-from jaxprt.cli.options import option
+from jaxprt.cli import inputs, options
 from jaxprt.files import objects
-from jaxprt.relit.planning import ERROR, Plan, key_of, plan
+from jaxprt.relit.build import precompute
+from jaxprt.relit.planning import ERROR, Candidate, Plan, key_of, plan
+
+_RATE = options.Range(0.0, kind=float, open=True, name="FPS")
 
 
-@click.command(cls=options.Command, short_help="Find the smallest system that meets an error.")
-@options.scene
-@options.light
-@option(
-    "--error",
-    group="Plan",
-    type=options.Finite(0.0, 1.0, open=True),
-    metavar="E",
-    help="Largest relative L2 error of the radiance of each part.  [default: 0.05, or the smallest that systems reach]",
+@options.command(
+    "plan",
+    "Find the smallest system that meets an error.",
+    options.FILES,
+    Scene=options.SCENE,
+    Light=options.LIGHT,
+    Plan=options.options_of(precompute, error=options.FRACTION, rate=_RATE),
+    Output=[
+        options.folder("Folder that keeps the plan, for `jaxprt relight --plan`, and the measurements."),
+        options.JSON,
+    ],
 )
-@option(
-    "--rate",
-    group="Plan",
-    type=options.Finite(0.0, open=True),
-    metavar="FPS",
-    default=30.0,
-    show_default=True,
-    help="Least frames per second with a new light and a new view in each frame, without rasterization.",
-)
-@options.folder("Folder that keeps the plan, for `jaxprt relight --plan`, and the measurements.")
-@options.as_json
-def command(**arguments: Any) -> None:
+def command(chosen: SimpleNamespace) -> options.Result:
     """Choose the system and sizes that meet an error with the fewest bytes, for each part of a scene.
 
     The table has a row for each candidate: its error, time per frame, bytes, and precomputation time, measured on a
@@ -46,59 +38,57 @@ def command(**arguments: Any) -> None:
       jaxprt relight scene.glb grace.hdr --plan kept
       jaxprt plan bunny.ply --brdf ggx:roughness=.2 --json > plan.json
     """  # noqa: D301
-    chosen = SimpleNamespace(**arguments)
-    with options.reserve_stdout(chosen.as_json):
-        result = _plan(chosen)
-    options.tell(plan_json(result), str(result), as_json=chosen.as_json)
-
-
-def _plan(chosen: SimpleNamespace) -> Plan:
-    scene, lights = inputs.scene(chosen), list(inputs.lights(chosen).values())
-    folder = None
-    if chosen.output is not None:
-        relight.make_folder(chosen.output)
-        folder = chosen.output / "plan"
-        if folder.exists():
-            stored = relight.load_plan(chosen.output)
-            asked = ERROR if chosen.error is None else chosen.error
-            if (stored.key, stored.asked, stored.rate) == (key_of(scene, lights), asked, chosen.rate):
-                return stored
+    scene, lights = options.call(inputs.scene, chosen), list(options.call(inputs.lights, chosen).values())
+    options.make_folder(chosen.output)
+    folder, measurements = (chosen.output and chosen.output / name for name in ("plan", "candidates"))
+    if folder is not None and folder.exists():
+        result, asked = load(folder), ERROR if chosen.error is None else chosen.error
+        if (result.key, result.asked, result.rate) != (key_of(scene, lights), asked, chosen.rate):
             raise ValueError(f"{folder} was made for another scene, lights, error or rate: name another --output")
-    candidates = None if chosen.output is None else chosen.output / "candidates"
-    options_ = {"error": chosen.error, "rate": chosen.rate, "path": candidates, "progress": sys.stderr.isatty()}
-    result = plan(scene, refine=False, environments=lights, **options_)
-    if folder is not None:
-        objects.save(folder, result)
-    return result
+    else:
+        wanted = {"error": chosen.error, "rate": chosen.rate, "environments": lights, "path": measurements}
+        result = plan(scene, refine=False, progress=sys.stderr.isatty(), **wanted)
+        if folder is not None:
+            objects.save(folder, result)
+    return options.Result(_content(result), str(result))
 
 
-def plan_json(result: Plan) -> dict[str, Any]:
+def load(folder: Path) -> Plan:
+    """Loads the plan in a folder that `jaxprt plan` or a planned run has written."""
+    path = folder / "plan" if (folder / "plan").is_dir() else folder
+    try:
+        plan = objects.load(path)
+    except ValueError as error:
+        raise ValueError(f"--plan must be a folder of `jaxprt plan`: {error}") from error
+    if not isinstance(plan, Plan):
+        raise ValueError(f"--plan must be a folder of `jaxprt plan`, got a {type(plan).__name__} in {path}")
+    return plan
+
+
+def _content(result: Plan) -> dict[str, Any]:
     """A plan as JSON."""
 
-    def candidate(option: Any) -> dict[str, Any]:
+    def candidate(option: Candidate) -> dict[str, Any]:
+        values = {"error": option.error, "seconds": option.seconds, "bytes": option.nbytes}
         sizes = {"system": type(option.recipe).__name__, **vars(option.recipe)}
-        numbers = {"error": option.error, "seconds": option.seconds, "bytes": option.nbytes}
-        numbers["precompute_seconds"] = option.precompute_seconds
-        return {"recipe": sizes, **{name: float(value) for name, value in numbers.items()}}
+        return {"recipe": sizes, **values, "precompute_seconds": option.precompute_seconds}
 
+    groups = [
+        {
+            "parts": group.names,
+            "vertices": group.vertices,
+            "mesh_error": group.mesh_error,
+            "chosen": candidate(group.chosen),
+            "considered": list(map(candidate, group.considered)),
+        }
+        for group in result.group
+    ]
     return {
         "asked": {"error": result.asked, "rate": result.rate, "light_size": result.size},
-        "groups": [
-            {
-                "parts": list(group.names),
-                "vertices": group.vertices,
-                "mesh_error": float(group.mesh_error),
-                "chosen": candidate(group.chosen),
-                "considered": [candidate(one) for one in group.considered],
-            }
-            for group in result.group
-        ],
-        "reflected": {
-            name: [float(share) for share in shares]
-            for name, shares in zip(result.names, result.reflected.T, strict=True)
-        },
+        "groups": groups,
+        "reflected": dict(zip(result.names, result.reflected.T, strict=True)),
         "bounces": result.bounces,
-        "error": float(result.error),
-        "seconds": float(result.seconds),
-        "bytes": float(result.nbytes),
+        "error": result.error,
+        "seconds": result.seconds,
+        "bytes": result.nbytes,
     }

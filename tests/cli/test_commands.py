@@ -8,52 +8,21 @@ import signal
 import subprocess
 import sys
 import time
-from types import SimpleNamespace
 
 import click
 import numpy as np
 import pytest
 
 import jaxprt as prt
-from jaxprt.cli import inputs, measure, options, planned, play, relight
+from jaxprt.cli import inputs, options, planned
 from jaxprt.cli import report as cli_report
 from jaxprt.cli.main import program
-from jaxprt.relit import measuring
-
-OBJ = "v 0 1 0\nv -1 -0.5 1\nv 1 -0.5 1\nv 0 -0.5 -1\nf 1 2 3\nf 1 3 4\nf 1 4 2\nf 2 4 3\n"
 
 
-@pytest.fixture(autouse=True)
-def small(coarse, bound, monkeypatch):
-    """Coarse tables, and few pixels that are judged."""
-    bound(monkeypatch, prt.lobe.tabulate, resolution=8)
-    monkeypatch.setattr(measuring, "_PICTURE", 32)
-    monkeypatch.setattr(measuring, "_PIXELS", 20)
-    monkeypatch.setattr(measure, "_RINGS", 6)
-    monkeypatch.setattr(measure, "_SECTORS", 8)
-    monkeypatch.setattr(cli_report, "TABLE_LOBES", (1, 4))
-    monkeypatch.setattr(cli_report, "TABLE_TEXELS", (0, 16))
-
-
-@pytest.fixture
-def place(tmp_path):
-    (tmp_path / "mesh.obj").write_text(OBJ)
-    sky = np.full((8, 16, 3), 0.5, np.float32)
-    sky[3, 4] = 90
-    prt.files.write_exr(tmp_path / "sky.exr", sky)
-    return tmp_path
-
-
-def main(*arguments):
-    """Exit status of the command line."""
-    with pytest.raises(SystemExit) as end:
-        program(list(map(str, arguments)), prog_name="jaxprt")
-    return end.value.code or 0
-
-
-def test_a_plan_is_printed_and_kept_and_relights(place, monkeypatch, capsys):
-    given = [place / "sky.exr", place / "mesh.obj", "--brdf", "lambert", "--light-size", "8"]
-    kept = ["--error", "0.5", "--output", place / "kept"]
+def test_a_plan_is_printed_and_kept_and_relights(main, place, tmp_path, monkeypatch, capsys):
+    files = [place / "sun.exr", place / "mesh.obj", "--brdf", "lambert"]
+    given = [*files, "--light-size", "8"]
+    kept = ["--error", "0.5", "--output", tmp_path / "kept"]
     assert main("plan", *given, *kept) == 0
     table = capsys.readouterr().out
     assert "error asked 50 %, 30 frames per second\nmesh: 4 vertices" in table
@@ -64,43 +33,51 @@ def test_a_plan_is_printed_and_kept_and_relights(place, monkeypatch, capsys):
     chosen = told["groups"][0]["chosen"]["recipe"]
     assert f"* {100 * told['error']:6.1f} %" in table
     assert chosen["system"] == "Harmonics"
-    assert main("plan", *given, "--error", "0.4", "--output", place / "kept") == 2
+    assert main("plan", *given, "--error", "0.4", "--output", tmp_path / "kept") == 2
     assert "kept/plan was made for another scene, lights, error or rate" in capsys.readouterr().err
     made = []
 
-    def make(view, recipe, *arguments, **options):
+    def make(view, recipe, output, **options):
         made.append((view, recipe, options))
         raise RuntimeError("enough")
 
     monkeypatch.setattr(cli_report, "make", make)
-    assert main("relight", *given[:-2], "--plan", place / "kept", "--output", place / "out") == 1
+    assert main("relight", *files, "--plan", tmp_path / "kept", "--output", tmp_path / "out") == 1
     ((view, recipe, options),) = made
     assert vars(recipe["mesh"]) == {name: value for name, value in chosen.items() if name != "system"}
-    assert view.lights["sky"].radiance.shape[-2] == 8  # the plan's size
+    assert view.lights["sun"].radiance.shape[-2] == 8  # the plan's size
     assert options["bounces"] == told["bounces"]
-    assert main("relight", *given, "--plan", place, "--output", place / "out") == 2
+    assert main("relight", *given, "--plan", place, "--output", tmp_path / "out") == 2
     assert "--plan must be a folder of `jaxprt plan`" in capsys.readouterr().err
 
 
-def test_a_scene_is_measured_as_its_report_says(place, capsys):
-    given = [place / "mesh.obj", place / "sky.exr", "--light-size", "8", "--brdf", "ggx:roughness=.6"]
-    assert main("measure", *given, "--lobes", "1,2", "--output", place / "kept", "--json") == 0
+def test_a_planned_scene_names_its_recipes(place, tmp_path):
+    lights = inputs.lights([place / "sun.exr"], light_size=8)
+    scene = inputs.scene([place / "mesh.obj"], brdf=prt.brdf.Lambert(), refine=False)
+    view = cli_report.View(scene, lights, inputs.camera(scene.parts))
+    _, cost = cli_report.make(view, None, tmp_path, error=0.5, environments=list(lights.values()), bounces=None)
+    assert cost["mesh"]["recipe"] == "Harmonics"
+
+
+def test_a_scene_is_measured_as_its_report_says(main, place, tmp_path, capsys):
+    given = [place / "mesh.obj", place / "sun.exr", "--light-size", "8", "--brdf", "ggx:roughness=.6"]
+    assert main("measure", *given, "--lobes", "1,2", "--output", tmp_path, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert list(told["systems"]) == ["lobe_1", "lobe_2"]  # from rays that are traced once
-    found = told["systems"]["lobe_2"]
-    assert told["lights"] == ["sky"]
-    assert found["parts"][0]["vertices"] == 4
-    assert 0 <= found["parts"][0]["vertex_error"]["sky"] < 0.3
-    assert found["bytes"] >= found["parts"][0]["bytes"] > 0
-    assert min(found["light_seconds"], found["view_seconds"]) > 0
+    lobes = told["systems"]["lobe_2"]
+    assert told["lights"] == ["sun"]
+    assert lobes["parts"][0]["vertices"] == 4
+    assert 0 <= lobes["parts"][0]["vertex_error"]["sun"] < 0.3
+    assert lobes["bytes"] >= lobes["parts"][0]["bytes"] > 0
+    assert min(lobes["light_seconds"], lobes["view_seconds"]) > 0
 
 
-def test_the_fit_of_a_brdf_is_measured_on_a_sphere(place, capsys):
-    given = ["--fit", "cook-torrance:roughness=.4", place / "sky.exr", "--light-size", "8", "--system", "lobe"]
+def test_the_fit_of_a_brdf_is_measured_on_a_sphere(main, place, capsys):
+    given = ["--fit", "cook-torrance:roughness=.4", place / "sun.exr", "--light-size", "8", "--system", "lobe"]
     assert main("measure", *given, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["material"]["model"] == "CookTorrance"
-    error = {(row["lobes"], row["texels"]): row["error sky"] for row in told["rows"]}
+    error = {(row["lobes"], row["texels"]): row["error sun"] for row in told["rows"]}
     assert error[4, 16] < error[1, 0] < 1
     assert main("measure", "--fit", "lambert", place / "mesh.obj") == 2
     assert "takes environments only, got a mesh: use --brdf" in capsys.readouterr().err
@@ -118,8 +95,8 @@ def test_info_without_files_says_that_the_compiler_of_users_computes_right_sums(
     assert told["jaxlib"] == importlib.metadata.version("jaxlib")
 
 
-def test_info_says_what_meshes_and_environments_hold(place, capsys):
-    assert main("info", place / "mesh.obj", place / "sky.exr", "--light-size", "16", "--json") == 0
+def test_info_says_what_meshes_and_environments_hold(main, place, capsys):
+    assert main("info", place / "mesh.obj", place / "sun.exr", "--light-size", "16", "--json") == 0
     mesh, sky = json.loads(capsys.readouterr().out)
     assert (mesh["kind"], mesh["vertices"], mesh["triangles"], mesh["cameras"]) == ("scene", 4, 4, [])
     assert mesh["bounds"] == [[-1, -0.5, -1], [1, 1, 1]]
@@ -132,75 +109,84 @@ def test_info_says_what_meshes_and_environments_hold(place, capsys):
     share = sky["brightest_share"]
     assert 0 < share["1"] < share["10"] < share["100"] < 1
     assert share["100"] > 90 * pixel / (4 * np.pi) / sky["mean_radiance"][0] * 0.99
+    assert main("info", place / "mesh.obj", place / "sun.exr") == 0
+    rows = capsys.readouterr().out
+    assert ": scene of 1 parts, 4 vertices, 4 triangles, 2 x 1.5 x 2 units, 0 cameras\n  0 'mesh': 4 vertices" in rows
+    assert "\n  radiance from 0.5 to 90, mean over the sphere " in rows
 
 
-def test_info_says_what_is_left_out_and_what_folders_hold(place, capsys):
-    prt.files.save(place / "kept" / "light", prt.load_environment(place / "sky.exr", size=8))
-    ball = prt.scene.builtin.sphere(rings=6, sectors=8)
-    prt.visibility.precompute(ball, size=8, run=prt.Run(place / "kept" / "seen.prt"))
-    (place / "mesh.obj").write_text("mtllib absent.mtl\nusemtl wood\n" + OBJ)
-    assert main("info", place / "kept", place / "mesh.obj") == 0
+def test_info_says_what_is_left_out_and_what_folders_hold(main, place, tmp_path, capsys):
+    store, checksum = tmp_path / "seen.prt", tmp_path / "seen.prt" / "checksum.npy"
+    prt.files.save(tmp_path / "light", prt.load_environment(place / "sun.exr", size=8))
+    prt.visibility.precompute(prt.scene.builtin.sphere(rings=6, sectors=8), size=8, run=prt.Run(store))
+    mesh = tmp_path / "mesh.obj"
+    mesh.write_text("mtllib absent.mtl\nusemtl wood\n" + (place / "mesh.obj").read_text())
+    assert main("info", tmp_path, mesh) == 0
     told = capsys.readouterr().out
     assert "light: object of Environment, " in told
     assert "blocks are finished" in told
     assert "left out: " in told
     assert "absent.mtl" in told
-    assert main("info", place / "kept" / "light", place / "kept" / "seen.prt", "--json") == 0
-    saved, store = json.loads(capsys.readouterr().out)
-    assert saved["bytes"] == sum(each.stat().st_size for each in (place / "kept" / "light").iterdir())
-    assert store["finished"] == store["blocks"] > 0
-    with (place / "kept" / "seen.prt" / "checksum.npy").open("r+b") as file:
+
+    def facts(*paths):
+        assert main("info", *paths, "--json") == 0
+        return json.loads(capsys.readouterr().out)
+
+    saved, whole = facts(tmp_path / "light", store)
+    assert saved["bytes"] == sum(path.stat().st_size for path in (tmp_path / "light").iterdir())
+    assert whole["finished"] == whole["blocks"] > 0
+    with checksum.open("r+b") as file:
         file.truncate(file.seek(0, 2) - 4)  # of a run that was stopped before its last block
-    assert main("info", place / "kept" / "seen.prt", "--json") == 0
-    assert json.loads(capsys.readouterr().out)[0]["finished"] == store["blocks"] - 1
-    np.save(place / "kept" / "seen.prt" / "checksum.npy", np.zeros(store["blocks"], np.uint32))
-    assert main("info", place / "kept" / "seen.prt", "--json") == 0
-    assert json.loads(capsys.readouterr().out)[0]["finished"] == 0
-    assert main("info", place) == 0
-    (place / "empty").mkdir()
-    assert main("info", place / "empty") == 2
+    assert facts(store)[0]["finished"] == whole["blocks"] - 1
+    np.save(checksum, np.zeros(whole["blocks"], np.uint32))
+    assert facts(store)[0]["finished"] == 0
+    (tmp_path / "empty").mkdir()
+    assert main("info", tmp_path / "empty") == 2
     assert "must be a folder that jaxprt wrote" in capsys.readouterr().err
 
 
-def test_info_says_how_brdf_files_are_used(data, capsys):
+def test_info_says_how_brdf_files_are_used(main, data, capsys):
     names = ["lafortune_measured.json", "ngan2005_wardduer.fit", "ngan2005_he.fit", "merl_npf_512x256_rgb32f.bin"]
     paths = [data / "brdf" / name for name in (*names, "cayman.brdf")]
     assert main("info", *paths, "--json") == 2  # one of them cannot be used; the others are told
     written = capsys.readouterr()
     told = json.loads(written.out)
     assert "must be one of NganBlinnPhong, NganCookTorrance, NganLafortune, NganWardDuer, got NganHe" in written.err
-    assert [each["form"] for each in told] == ["lafortune", "ngan", "npf", "scattered"]
-    assert [len(each["materials"]) for each in told[:3]] == [6, 86, 100]
+    assert [row["form"] for row in told] == ["lafortune", "ngan", "npf", "scattered"]
+    assert [len(row["materials"]) for row in told[:3]] == [6, 86, 100]
     assert told[0]["use"] == f"lafortune:{paths[0]},material=clay"
+    assert told[1]["model"] == "WardDuer"
     assert told[3]["samples"] == 1439
     assert main("info", __file__) == 2
     assert "must be a mesh or an environment" in capsys.readouterr().err
 
 
 def test_lights_are_turned_counterclockwise_as_seen_from_above(place):
-    options = play.parse_options([str(place / "sky.exr"), "--turn", "0,90", "--light-size", "16"])
-    lights = inputs.lights(options)
-    assert list(lights) == ["sky_0", "sky_90"]
-    still, turned = (np.asarray(each.radiance).sum(-1) for each in lights.values())
+    lights = inputs.lights([place / "sun.exr"], turn=(0.0, 90.0), light_size=16)
+    assert list(lights) == ["sun_0", "sun_90"]
+    still, turned = (np.asarray(light.radiance).sum(-1) for light in lights.values())
     solid, direction = prt.sphere.cubemap.solid_angle(size=16), prt.sphere.cubemap.direction(size=16)
-    before, after = (np.einsum("fij,fij,fijk->k", each, solid, direction) for each in (still, turned))
+    before, after = (np.einsum("fij,fij,fijk->k", light, solid, direction) for light in (still, turned))
     np.testing.assert_allclose(after, [before[2], before[1], -before[0]], atol=0.02 * np.linalg.norm(before))
     np.testing.assert_allclose(turned.mean(), still.mean(), rtol=1e-2)
 
 
-def test_environments_are_told_by_their_content_where_the_suffix_says_nothing(place):
-    (place / "sky").write_bytes((place / "sky.exr").read_bytes())
-    assert inputs.split_files([place / "sky", place / "mesh.obj"]) == ([place / "mesh.obj"], [place / "sky"])
+def test_environments_are_told_by_their_content_where_the_suffix_says_nothing(place, tmp_path):
+    (tmp_path / "sky").write_bytes((place / "sun.exr").read_bytes())
+    assert inputs.split_files([tmp_path / "sky", place / "mesh.obj"]) == ([place / "mesh.obj"], [tmp_path / "sky"])
 
 
-def test_parts_take_materials_by_name_and_by_number():
-    given = play.parse_options(["--material", "2=ward", "--material", "pieces=metallic-roughness:roughness=.3"])
-    kinds = [type(part.material).__name__ for part in inputs.scene(given, playable=True).parts]
-    assert kinds == ["TexturedMaterial", "TexturedMaterial", "Ward"]
+def test_without_files_there_are_the_chess_pieces_whose_materials_are_named_or_numbered(chosen):
+    given = chosen("--material", "2=ward", "--material", "pieces=metallic-roughness:roughness=.3")
+    parts = options.call(inputs.scene, given, playable=True).parts
+    assert [part.name for part in parts] == ["pieces", "light squares", "dark squares"]
+    assert [type(part.material).__name__ for part in parts] == ["TexturedMaterial", "TexturedMaterial", "Ward"]
+    assert parts[0].material.roughness == np.float32(0.3)
+    assert list(options.call(inputs.lights, given, light_size=8)) == ["daylight", "studio"]
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_the_script_for_completion_is_printed(shell, capsys):
+def test_the_script_for_completion_is_printed(shell, main, capsys):
     assert main("completion", shell) == 0
     assert "_JAXPRT_COMPLETE" in capsys.readouterr().out
 
@@ -215,26 +201,36 @@ def test_the_script_for_completion_is_printed(shell, capsys):
         ("jaxprt view --light", ["--light-size"]),
     ],
 )
-def test_shells_complete_commands_options_systems_and_materials(words, expected, monkeypatch, capsys):
+def test_shells_complete_commands_options_systems_and_materials(words, expected, main, monkeypatch, capsys):
     monkeypatch.setenv("_JAXPRT_COMPLETE", "zsh_complete")
     monkeypatch.setenv("COMP_WORDS", words)
     monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
     main()
-    found = capsys.readouterr().out.split("\n")[1::3]
-    assert found == expected
+    assert capsys.readouterr().out.split("\n")[1::3] == expected
 
 
 def test_every_command_and_option_says_what_it_does():
     for name, command in program.commands.items():
         assert name == "completion" or f"\n  jaxprt {name} " in inspect.cleandoc(command.help)
-        for each in command.params:
-            assert not isinstance(each, click.Option) or each.help, (name, each.name)
+        for option in command.params:
+            assert not isinstance(option, click.Option) or option.help, (name, option.name)
+
+
+def test_options_have_the_defaults_and_words_of_what_commands_call(main, capsys):
+    assert main("relight", "--help") == 0
+    help = " ".join(capsys.readouterr().out.split())
+    assert "--system [planned|lobe|harmonic|separable|clusters|dynamic],.." in help
+    assert "and term [default: separable 96]; Number of wavelet coefficients of each cluster [default: clusters" in help
+    assert "Largest relative L2 error of the radiance of each part. [default: 0.05, or the smallest error" in help
+    assert "--size N Width and height of the pictures in pixels. [from 1 to 8192] [default: 512]" in help
+    assert main("view", "--help") == 0
+    assert "[default: lobe 8, dynamic 12]" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-def test_ctrl_c_ends_a_process_with_130_and_without_a_traceback(place):
+def test_ctrl_c_ends_a_process_with_130_and_without_a_traceback():
     script = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "  # background jobs ignore it
-    script += "import jaxprt.cli.relight as r, time; print('up', flush=True); r._run = lambda *_: time.sleep(60); "
+    script += "import jaxprt.cli.relight as r, time; print('up', flush=True); r._systems = lambda *_: time.sleep(60); "
     script += "from jaxprt.cli.main import run; run()"
     process = subprocess.Popen(
         [sys.executable, "-c", script, "relight"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -247,22 +243,26 @@ def test_ctrl_c_ends_a_process_with_130_and_without_a_traceback(place):
     assert err == "jaxprt: stopped; the same command goes on from here\n"
 
 
-def test_relight_knows_all_systems():
-    assert set(relight.SYSTEMS) == {"planned", "lobe", "harmonic", "separable", "clusters", "dynamic"}
-
-
 def test_meshes_are_divided_to_the_error_that_is_asked_for(place):
-    chosen = {"files": [place / "mesh.obj"], "outside": False, "up": "y", "ground": False, "brdf": None, "material": ()}
-    counts = [len(inputs.scene(SimpleNamespace(**chosen, refine=refine)).mesh.position) for refine in (False, 0.2, 0.1)]
+    counts = [inputs.scene([place / "mesh.obj"], refine=refine).counts[0] for refine in (False, 0.2, 0.1)]
     assert counts[0] == 4 < counts[1] < counts[2]
 
 
-@pytest.mark.parametrize(("text", "value"), [("off", False), ("0.02", 0.02), ("0", 0.0)])
-def test_errors_of_divided_meshes_are_numbers_or_off(text, value):
-    assert options.Refinement().convert(text, None, None) == value
+@pytest.mark.parametrize(
+    ("kind", "text", "value"),
+    [
+        (options.REFINE, "off", False),
+        (options.REFINE, "0.02", 0.02),
+        (options.REFINE, "0", 0.0),
+        (options.BOUNCES, "all", "all"),
+        (options.BOUNCES, "2", 2),
+    ],
+)
+def test_numbers_have_words_for_some_values(kind, text, value):
+    assert kind.convert(text, None, None) == value
 
 
 @pytest.mark.parametrize("text", ["fine", "-1", "nan", "inf", ""])
 def test_other_errors_of_divided_meshes_are_refused(text):
-    with pytest.raises(click.UsageError, match="must be an error of at least 0"):
-        options.Refinement().convert(text, None, None)
+    with pytest.raises(click.UsageError, match='must be a finite number of at least 0, or "off", got '):
+        options.REFINE.convert(text, None, None)

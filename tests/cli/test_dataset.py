@@ -8,31 +8,20 @@ import OpenImageIO
 import pytest
 from click.testing import CliRunner
 
-import jaxprt as prt
 from jaxprt.cli.main import program
 from jaxprt.scene.formats import nerf
 
-OBJ = "v 0 0 0\nv 1 0 0\nv 0 0 1\nv 0 1 0\nf 1 2 3\nf 1 4 2\nf 1 3 4\nf 2 4 3\n"
-
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    """A folder with two meshes, a file that is none, and two skies."""
-    folder = tmp_path_factory.mktemp("dataset")
-    (folder / "one.obj").write_text(OBJ)
-    (folder / "two.obj").write_text(OBJ.replace("v 0 1 0", "v 0 2 0"))
-    (folder / "bad.obj").write_text("# nothing\n")
-    sky = np.random.default_rng(0).uniform(0.1, 2, size=(4, 8, 3)).astype(np.float32)
-    prt.files.write_exr(folder / "sky.exr", sky)
-    prt.files.write_exr(folder / "dusk.exr", sky[::-1] / 3)
-    return folder
+def run(place):
+    """The function from options to the result of the command."""
 
+    def dataset(output, *more, meshes=("mesh.obj",), lights="*sk*.exr"):
+        options = ["--size", "16", "--light-size", "8", "--refine", "off", "--brdf", "lambert", "--system", "harmonic"]
+        arguments = ["dataset", *(place / name for name in meshes), "--lights", place / lights, *options]
+        return CliRunner().invoke(program, list(map(str, [*arguments, "--output", output, *more])))
 
-def run(place, output, *more, meshes=("one.obj",), lights="*.exr"):
-    options = ["--size", "16", "--light-size", "8", "--refine", "off", "--brdf", "lambert", "--system", "harmonic"]
-    files = [str(place / name) for name in meshes]
-    arguments = ["dataset", *files, "--lights", str(place / lights), *options, "--output", str(output), *more]
-    return CliRunner().invoke(program, arguments)
+    return dataset
 
 
 def channels(path):
@@ -42,10 +31,10 @@ def channels(path):
 
 
 @pytest.fixture(scope="module")
-def whole(place):
+def whole(run, tmp_path_factory):
     """Two scenes under two lights from three cameras."""
-    output = place / "set"
-    result = run(place, output, "--views", "3", "--layers", "color,alpha,position", meshes=("one.obj", "two.obj"))
+    output = tmp_path_factory.mktemp("dataset") / "set"
+    result = run(output, "--views", "3", "--layers", "color,alpha,position", meshes=("mesh.obj", "two.obj"))
     assert result.exit_code == 0, result.output
     return output
 
@@ -54,7 +43,7 @@ def test_each_light_is_seen_from_each_camera_of_each_scene(whole):
     rows = [json.loads(line) for line in (whole / "manifest.jsonl").read_text().splitlines()]
     assert len(rows) == 2 * 2 * 3
     assert {(row["scene"], row["light"], row["view"]) for row in rows} == {
-        (scene, light, view) for scene in ("one", "two") for light in ("sky", "dusk") for view in range(3)
+        (scene, light, view) for scene in ("mesh", "two") for light in ("sky", "dusk") for view in range(3)
     }
     assert all((whole / row["file"]).exists() for row in rows)
     assert all(0 <= row["turn"] < 360 and row["error"] >= 0 for row in rows)
@@ -62,9 +51,9 @@ def test_each_light_is_seen_from_each_camera_of_each_scene(whole):
 
 
 def test_positions_of_pictures_project_to_their_pixels_by_the_cameras_file(whole):
-    content = json.loads((whole / "one" / "transforms.json").read_text())
+    content = json.loads((whole / "mesh" / "transforms.json").read_text())
     for frame in content["frames"]:
-        names, values = channels(whole / "one" / frame["file_path"])
+        names, values = channels(whole / "mesh" / frame["file_path"])
         assert names == ["R", "G", "B", "A", "position.X", "position.Y", "position.Z"]
         seen = values[..., 3] == 1
         assert np.count_nonzero(seen) > 10
@@ -76,59 +65,44 @@ def test_positions_of_pictures_project_to_their_pixels_by_the_cameras_file(whole
         assert np.max(np.abs(content["h"] / 2 - focal * local[1] / -local[2] - row - 0.5)) < 0.51
 
 
-def test_a_set_goes_on_where_it_stopped_with_the_same_files(place, whole, tmp_path):
+def test_a_set_goes_on_where_it_stopped_with_the_same_files(run, whole, tmp_path):
     options = ("--views", "3", "--layers", "color,alpha,position")
-    assert run(place, tmp_path / "set", *options).exit_code == 0
-    again = tmp_path / "set" / "one"
+    assert run(tmp_path / "set", *options).exit_code == 0
+    again = tmp_path / "set" / "mesh"
     before = {path.name: path.read_bytes() for path in again.iterdir()}
     for name in ("manifest.jsonl", "0001_sky.exr", "0002_sky.exr", "0002_dusk.exr"):
         (again / name).unlink()
-    result = run(place, tmp_path / "set", *options)
+    result = run(tmp_path / "set", *options)
     assert result.exit_code == 0
     assert {path.name: path.read_bytes() for path in again.iterdir()} == before
-    assert {name: (whole / "one" / name).read_bytes() for name in before} == before  # whatever other scenes there are
+    assert {name: (whole / "mesh" / name).read_bytes() for name in before} == before  # whatever other scenes there are
 
 
-def test_cameras_come_from_a_file_and_shards_hold_pictures_with_their_lines(place, whole, tmp_path):
-    cameras = whole / "one" / "transforms.json"
+def test_cameras_come_from_a_file_and_shards_hold_pictures_with_their_lines(run, whole, tmp_path):
+    cameras = whole / "mesh" / "transforms.json"
     output = tmp_path / "set"
-    result = run(
-        place, output, "--cameras", str(cameras), "--shards", "--format", "png", "--random-turns", "0", lights="sky*"
-    )
+    options = ("--cameras", cameras, "--shards", "--format", "png", "--random-turns", "0")
+    result = run(output, *options, lights="sky*")
     assert result.exit_code == 0, result.output
     count = len(nerf.load(cameras))
-    with tarfile.open(output / "one.tar") as archive:
+    with tarfile.open(output / "mesh.tar") as archive:
         names = archive.getnames()
         line = json.load(archive.extractfile(names[1]))
         first = archive.extractfile(names[0]).read()
     assert len(names) == 2 * count
     assert line == json.loads((output / "manifest.jsonl").read_text().splitlines()[0])
-    assert (line["file"], line["turn"], names[1]) == (names[0], 0.0, "one/0000_sky.json")
+    assert (line["file"], line["turn"], names[1]) == (names[0], 0.0, "mesh/0000_sky.json")
     (tmp_path / "first.png").write_bytes(first)
     assert channels(tmp_path / "first.png")[1].shape == (16, 16, 4)
-    assert not list((output / "one").glob("*.png"))
-    assert (
-        run(
-            place,
-            output,
-            "--cameras",
-            str(cameras),
-            "--shards",
-            "--format",
-            "png",
-            "--random-turns",
-            "0",
-            lights="sky*",
-        ).exit_code
-        == 0
-    )
+    assert not list((output / "mesh").glob("*.png"))
+    assert run(output, *options, lights="sky*").exit_code == 0
 
 
-def test_a_scene_that_fails_is_named_and_does_not_stop_others(place, tmp_path):
-    result = run(place, tmp_path / "set", "--views", "1", meshes=("bad.obj", "one.obj"), lights="sky*")
+def test_a_scene_that_fails_is_named_and_does_not_stop_others(run, tmp_path):
+    result = run(tmp_path / "set", "--views", "1", meshes=("empty.obj", "mesh.obj"), lights="sky*")
     assert result.exit_code == 1
-    assert "scenes that failed: 1; bad: " in result.output
-    assert (tmp_path / "set" / "one" / "0000_sky.exr").exists()
+    assert "scenes that failed: 1; empty: " in result.output
+    assert (tmp_path / "set" / "mesh" / "0000_sky.exr").exists()
 
 
 @pytest.mark.parametrize(
@@ -144,17 +118,17 @@ def test_a_scene_that_fails_is_named_and_does_not_stop_others(place, tmp_path):
     ],
     ids=str,
 )
-def test_sets_that_are_none_are_refused(place, tmp_path, more, options, words):
-    result = run(place, tmp_path / "set", *more, **options)
+def test_sets_that_are_none_are_refused(run, tmp_path, more, options, words):
+    result = run(tmp_path / "set", *more, **options)
     assert result.exit_code == 2
     assert words in " ".join(result.output.split())
 
 
-def test_a_folder_of_another_set_is_refused(place, whole, tmp_path):
-    result = run(place, whole, "--views", "4", "--layers", "color,alpha,position")
+def test_a_folder_of_another_set_is_refused(run, whole, tmp_path):
+    result = run(whole, "--views", "4", "--layers", "color,alpha,position")
     assert result.exit_code == 2
     assert "views of the set in" in result.output
     (tmp_path / "other.txt").write_text("")
-    result = run(place, tmp_path)
+    result = run(tmp_path)
     assert result.exit_code == 2
     assert "--output must be an empty folder" in result.output

@@ -5,61 +5,27 @@ import json
 import socket
 import threading
 import urllib.parse
-from types import SimpleNamespace
 
 import equinox as eqx
 import numpy as np
 import pytest
 
 import jaxprt as prt
-from jaxprt import files
-from jaxprt.cli import inputs, play
-from jaxprt.cli.main import program
+from jaxprt.cli import inputs, options, play
 from jaxprt.view import Session, messages
 from jaxprt.view.progress import Progress
 
-OBJ = "v 0 1 0\nv -1 -0.5 1\nv 1 -0.5 1\nv 0 -0.5 -1\nf 1 2 3\nf 1 3 4\nf 1 4 2\nf 2 4 3\n"
 
-
-@pytest.fixture(autouse=True)
-def small(coarse, bound, monkeypatch):
-    """Coarse tables and lights."""
-    bound(monkeypatch, prt.load_environment, size=8)
-    for name in ("tabulate",):
-        bound(monkeypatch, getattr(prt.lobe, name), resolution=8)
-    bound(monkeypatch, play.precompute, size=8)
-
-
-@pytest.fixture
-def place(tmp_path):
-    (tmp_path / "first.obj").write_text(OBJ)
-    (tmp_path / "second.obj").write_text(OBJ)
-    files.write_exr(tmp_path / "sky.exr", np.full((8, 16, 3), 0.5, np.float32))
-    return tmp_path
-
-
-def main(arguments):
-    """Exit status of the command line."""
-    with pytest.raises(SystemExit) as end:
-        program(arguments, prog_name="jaxprt")
-    return end.value.code or 0
-
-
-def options(*argument: str) -> SimpleNamespace:
-    return play.parse_options(argument)
-
-
-def test_files_are_told_by_their_names_and_parts_without_a_material_are_plastic(place):
-    given = options(*(str(place / name) for name in ("first.obj", "sky.exr", "second.obj")), "--ground")
-    scene = inputs.scene(given, playable=True)
+def test_files_are_told_by_their_names_and_parts_without_a_material_are_plastic(chosen, place):
+    given = chosen(*(place / name for name in ("mesh.obj", "sky.exr", "two.obj")), "--ground")
+    scene = options.call(inputs.scene, given, playable=True)
     assert len({part.name for part in scene.parts}) == 3
     assert [float(part.material.specular) for part in scene.parts] == [1, 1, 0]
-    assert list(inputs.lights(given)) == ["sky"]
+    assert list(options.call(inputs.lights, given, light_size=8)) == ["sky"]
 
 
 def test_the_first_camera_frames_the_object_and_not_the_ground_below(place):
-    given = [str(place / name) for name in ("first.obj", "sky.exr")]
-    alone, grounded = (inputs.scene(options(*given, *more)) for more in ((), ("--ground",)))
+    alone, grounded = (inputs.scene([place / "mesh.obj"], ground=ground, refine=False) for ground in (False, True))
     expected = prt.scene.camera.orbit(alone.mesh, azimuth=0.5, elevation=0.3)
     assert eqx.tree_equal(grounded.cameras, (expected,))
     assert not alone.cameras
@@ -67,7 +33,7 @@ def test_the_first_camera_frames_the_object_and_not_the_ground_below(place):
     assert high > 2 * low
 
 
-def test_previews_divided_meshes_and_systems_are_one_way(place, monkeypatch):
+def test_previews_divided_meshes_and_systems_are_one_way(chosen, place, monkeypatch):
     session, shares = Session(), []
     report = session.report
 
@@ -76,41 +42,35 @@ def test_previews_divided_meshes_and_systems_are_one_way(place, monkeypatch):
         shares.append(session.progress.content()["fraction"])
 
     monkeypatch.setattr(session, "report", heard)
-    play.prepare(session, options(str(place / "first.obj"), "--lobes", "1,2", "--light-size", "8"))
+    play.prepare(session, chosen(place / "mesh.obj", "--lobes", "1,2", "--light-size", "8"))
     told = [share for share in shares if share is not None]
     assert len(told) > 2, told
     assert told == sorted(told)
     assert 0.2 < told[-1] < 1, told
 
 
-def test_without_files_there_are_the_chess_pieces_in_two_lights():
-    scene = inputs.scene(options(), playable=True)
-    assert [part.name for part in scene.parts] == ["pieces", "light squares", "dark squares"]
-    assert list(inputs.lights(options("--light-size", "8"))) == ["daylight", "studio"]
-
-
-def test_a_page_a_baked_scene_and_probes_are_written(place, capsys):
-    out = [place / name for name in ("piece.html", "baked.glb", "probes.json")]
-    files = [str(place / "first.obj"), str(place / "sky.exr"), "--light-size", "8", "--lobes", "1", "--error", "0.15"]
-    written = [word for path in out for word in ("--output", str(path))]
-    assert main(["export", *files, *written, "--json", "--tool", "three.js,unity"]) == 0
+def test_a_page_a_baked_scene_and_probes_are_written(main, place, tmp_path, capsys):
+    out = [tmp_path / name for name in ("piece.html", "baked.glb", "probes.json")]
+    given = [place / "mesh.obj", place / "gray.exr", "--light-size", "8", "--lobes", "1", "--error", "0.15"]
+    written = [word for path in out for word in ("--output", path)]
+    assert main("export", *given, *written, "--json", "--tool", "three.js,unity") == 0
     told = json.loads(capsys.readouterr().out)
     assert [row["kind"] for row in told] == ["page", "baked", "probes"]
     assert [row["bytes"] for row in told] == [path.stat().st_size for path in out]
     assert 0 <= told[0]["error"] < 0.15  # visibility of 8 texels along an edge
-    assert (told[1]["light"], told[1]["exposure"] > 0) == ("sky", True)
+    assert (told[1]["light"], told[1]["exposure"] > 0) == ("gray", True)
     probes = json.loads(out[2].read_text())
     assert list(probes) == ["three.js", "Unity"]
     constant = np.zeros((9, 3))
     constant[0] = 0.5 * np.sqrt(4 * np.pi)  # the light is 0.5 everywhere
-    np.testing.assert_allclose(probes["three.js"]["sky"], constant, atol=1e-5)
+    np.testing.assert_allclose(probes["three.js"]["gray"], constant, atol=1e-5)
 
 
-def test_a_scene_with_transfer_is_written(place, capsys):
-    out = place / "prt.glb"
-    given = [str(place / "first.obj"), str(place / "sky.exr"), "--light-size", "8", "--lobes", "1"]
-    assert main(["export", *given, "--format", "gltf", "--degree", "2", "--output", str(out)]) == 0
-    assert "with transfer of degree 2 in vertex attributes, and lights sky" in capsys.readouterr().out
+def test_a_scene_with_transfer_is_written(main, place, tmp_path, capsys):
+    out = tmp_path / "prt.glb"
+    given = [place / "mesh.obj", place / "gray.exr", "--light-size", "8", "--lobes", "1"]
+    assert main("export", *given, "--format", "gltf", "--degree", "2", "--output", out) == 0
+    assert "with transfer of degree 2 in vertex attributes, and lights gray" in capsys.readouterr().out
     data = out.read_bytes()
     head = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
     assert head["asset"]["extras"]["prt"]["degree"] == 2
@@ -127,9 +87,11 @@ def test_a_scene_with_transfer_is_written(place, capsys):
         ([], "Missing option '--output'"),
     ],
 )
-def test_exports_that_cannot_be_written_are_refused_before_anything_is_computed(arguments, words, monkeypatch, capsys):
+def test_exports_that_cannot_be_written_are_refused_before_anything_is_computed(
+    arguments, words, main, monkeypatch, capsys
+):
     monkeypatch.setattr(inputs, "lights", None)
-    assert main(["export", *arguments]) == 2
+    assert main("export", *arguments) == 2
     assert words in capsys.readouterr().err
 
 
@@ -137,29 +99,29 @@ def test_exports_that_cannot_be_written_are_refused_before_anything_is_computed(
     ("name", "reason"), [("file/probes.json", "Not a directory"), ("x" * 300 + ".json", "File name")]
 )
 def test_an_export_to_a_place_that_cannot_be_written_names_it_and_the_reason(
-    name, reason, tmp_path, monkeypatch, capsys
+    name, reason, main, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setattr(inputs, "lights", None)
     (tmp_path / "file").write_text("precious")
     fine, path = tmp_path / "fine.json", tmp_path / name
-    assert main(["export", "--output", str(fine), "--output", str(path)]) == 1
+    assert main("export", "--output", fine, "--output", path) == 1
     assert f"Error: --output must be a file that can be written, got {path}: {reason}" in capsys.readouterr().err
     assert (tmp_path / "file").read_text() == "precious"
     assert not fine.exists()
 
 
-def test_folders_that_cannot_be_made_are_refused_before_anything_is_computed(tmp_path, monkeypatch, capsys):
+def test_folders_that_cannot_be_made_are_refused_before_anything_is_computed(main, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(inputs, "lights", None)
     monkeypatch.setattr(inputs, "scene", None)
     (tmp_path / "file").write_text("precious")
-    within = str(tmp_path / "file" / "within")
-    assert main(["export", "--output", str(tmp_path / "piece.html"), "--store", within]) == 2
+    within = tmp_path / "file" / "within"
+    assert main("export", "--output", tmp_path / "piece.html", "--store", within) == 2
     assert f"--store must be a folder that can be made, got {within}: Not a directory" in capsys.readouterr().err
-    assert main(["view", "--output", within]) == 2
+    assert main("view", "--output", within) == 2
     assert f"--output must be a folder that can be made, got {within}: Not a directory" in capsys.readouterr().err
 
 
-def test_the_page_of_files_is_served(place, monkeypatch, capsys):
+def test_the_page_of_files_is_served(main, place, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(inputs.builtin, "daylight", None)
     opened = []
     monkeypatch.setattr(play.webbrowser, "open", opened.append)
@@ -174,25 +136,23 @@ def test_the_page_of_files_is_served(place, monkeypatch, capsys):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(prt.view.Server, "wait", look)
-    store = str(place / "store")
-    files = [str(place / "first.obj"), str(place / "sky.exr")]
-    assert main(["view", *files, "--output", store, "--lobes", "1,2", "--light-size", "8"]) == 0
+    given = [place / "mesh.obj", place / "sky.exr", "--lobes", "1,2", "--light-size", "8"]
+    assert main("view", *given, "--output", tmp_path) == 0
     assert answers[0]["lights"] == ["sky"]
     assert list(answers[0]["systems"]) == ["1 lobes", "2 lobes"]
     assert answers[0]["vertices"] == 4
     assert "http://127.0.0.1:" in capsys.readouterr().out
 
 
-def test_what_a_file_lacks_is_told_after_the_page_is_there(place, capsys):
-    (place / "broken.glb").write_bytes(b"glTF and no more")
-    assert main(["view", str(place / "broken.glb"), "--no-browser"]) == 2
+def test_what_a_file_lacks_is_told_after_the_page_is_there(main, place, capsys):
+    assert main("view", place / "broken.glb", "--no-browser") == 2
     said = capsys.readouterr()
     assert "http://127.0.0.1:" in said.out
     assert "broken.glb" in said.err
     assert "Traceback" not in said.err
 
 
-def test_ctrl_c_during_the_preparation_ends_it_and_the_command(place, monkeypatch, capsys):
+def test_ctrl_c_during_the_preparation_ends_it_and_the_command(main, monkeypatch, capsys):
     began, interrupted, ended = threading.Event(), threading.Event(), threading.Event()
 
     def prepare(session, chosen):
@@ -210,19 +170,19 @@ def test_ctrl_c_during_the_preparation_ends_it_and_the_command(place, monkeypatc
 
     monkeypatch.setattr(play, "prepare", prepare)
     monkeypatch.setattr(Progress, "wait", interrupt)
-    assert main(["view", "--no-browser"]) == 130
+    assert main("view", "--no-browser") == 130
     assert "jaxprt: stopped; the same command goes on from here" in capsys.readouterr().err
     interrupted.set()
     assert ended.wait(60)
 
 
-def test_a_port_that_is_taken_is_refused_before_anything_is_computed(monkeypatch, capsys):
+def test_a_port_that_is_taken_is_refused_before_anything_is_computed(main, monkeypatch, capsys):
     monkeypatch.setattr(play, "prepare", None)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        assert main(["view", "--port", str(port)]) == 2
+        assert main("view", "--port", port) == 2
     assert f"--port must be free, got {port}: another program uses it" in capsys.readouterr().err
 
 
@@ -231,39 +191,28 @@ def test_a_port_that_is_taken_is_refused_before_anything_is_computed(monkeypatch
     [
         (["--port", "70000"], "'--port': must be a whole number from 0 to 65535, got 70000"),
         (["--ground"], "--ground needs a mesh"),
+        (["--light-size", "12"], "--light-size must be a power of two, got 12"),
         (["nothing.obj"], "nothing.obj"),
         (["nothing.exr"], "nothing.exr"),
     ],
 )
-def test_what_cannot_be_shown_is_an_error(argument, words, capsys):
-    assert main(["view", *argument]) == 2
+def test_what_cannot_be_shown_is_an_error(argument, words, main, capsys):
+    assert main("view", *argument) == 2
     assert words in capsys.readouterr().err
 
 
 def test_a_page_far_from_the_scene_is_refused_with_the_cause_and_written_where_its_error_is_accepted(
-    data, tmp_path, capsys
+    main, data, tmp_path, capsys
 ):
     given = [data / "foreign/craft_speederD.gltf", data / "env/polyhaven_spiaggia_di_mondello_1k.hdr"]
-    page = tmp_path / "ship.html"
-    command = [
-        "export",
-        *map(str, given),
-        "--light-size",
-        "8",
-        "--lobes",
-        "1",
-        "--refine",
-        "off",
-        "--output",
-        str(page),
-    ]
-    assert main(command) == 2
+    page, sizes = tmp_path / "ship.html", ["--light-size", "8", "--lobes", "1", "--refine", "off"]
+    assert main("export", *given, *sizes, "--output", page) == 2
     told = capsys.readouterr().err
     assert "error must be at least 0." in told
     assert "for this page, got 0.05: its pictures are" in told
     assert "in the light 'polyhaven_spiaggia_di_mondello_1k'" in told
     assert "% by edges of shadows that lie between vertices: divide the meshes finer (refine)" in told
     assert not page.exists()
-    assert main([*command, "--error", "1"]) == 0
+    assert main("export", *given, *sizes, "--output", page, "--error", "1") == 0
     assert page.exists()
     assert "edges of shadows that lie between vertices" in capsys.readouterr().out

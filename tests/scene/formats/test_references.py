@@ -11,7 +11,7 @@ import warnings
 import numpy as np
 import pytest
 
-from jaxprt.cli import info, play
+from jaxprt.cli import info
 from jaxprt.cli import inputs as command_inputs
 from jaxprt.files import inputs, write_png
 from jaxprt.scene import load_mesh, load_scene
@@ -245,8 +245,8 @@ def test_files_that_exceed_the_memory_are_refused(place, monkeypatch):
 def test_the_command_line_allows_it_by_an_option(place):
     path = scene_of_buffer(place, "../secret")
     with pytest.raises(ValueError, match="--outside"):
-        command_inputs.scene(play.parse_options([str(path)]))
-    assert len(command_inputs.scene(play.parse_options([str(path), "--outside"])).parts[0].mesh.face) == 2
+        command_inputs.scene([path])
+    assert len(command_inputs.scene([path], outside=True).parts[0].mesh.face) == 2
     with pytest.raises(ValueError, match="--outside"):
         info.describe_path(path, 8, outside=False)
     assert info.describe_path(path, 8, outside=True)["triangles"] == 2
