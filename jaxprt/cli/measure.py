@@ -22,7 +22,7 @@ _VERTICES = 300
     options.FILES,
     Scene=options.SCENE,
     Light=options.LIGHT,
-    System=[options.systems(options.PLANNED, "One or several.  [default: lobe]", None), *options.PLAN],
+    System=[options.systems(options.PLANNED, "One or several.  [default: lobe]", default=None), *options.PLAN],
     Sizes=options.sizes(),
     Fit=[{"fit": (options.Material(),)}],
     Output=[options.folder("Folder that keeps precomputed data for later runs."), options.JSON],

@@ -83,7 +83,7 @@ def command(
         words, members = described(function), {}
         for title, group in groups.items():
             members[title] = [
-                option(key, words[key], *value) if key else value
+                option(key, words[key], value[0], default=value[1] if value[1:] else None) if key else value
                 for member in group
                 for key, value in (member if isinstance(member, dict) else {"": member}).items()
             ]
@@ -102,7 +102,7 @@ def call(function: Callable, chosen: SimpleNamespace, **more: Any) -> Any:
     return function(**{name: value for name, value in vars(chosen).items() if name in known} | more)
 
 
-def option(name: str, words: str, kind: Any = None, default: Any = None) -> click.Option:
+def option(name: str, words: str, kind: Any, *, default: Any = None) -> click.Option:
     """An option whose help shows its default and its range. One whose default is () may be given several times."""
     names = [f"--{name.replace('_', '-')}", name]
     if kind is bool:
@@ -130,7 +130,7 @@ def described(documented: Any) -> collections.defaultdict[str, str]:
 def options_of(function: Callable, **kinds: Any) -> list[click.Option]:
     """Options for parameters of a function, by the types of their values; all else is the function's."""
     words, known = described(function), inspect.signature(function).parameters
-    return [option(name, words[name], kind, known[name].default) for name, kind in kinds.items()]
+    return [option(name, words[name], kind, default=known[name].default) for name, kind in kinds.items()]
 
 
 class Range(click.ParamType):
@@ -258,13 +258,13 @@ LIGHT_SIZE = options_of(inputs.lights, light_size=Range(1, 1024))
 LIGHT = [*options_of(inputs.lights, turn=Several(DEGREES)), *LIGHT_SIZE]
 JSON = option("json", "Print the result as JSON on stdout.", bool)
 PLAN = options_of(precompute, error=FRACTION, bounces=BOUNCES)
-NO_BOUNCES = option("bounces", described(precompute)["bounces"].partition("  [")[0], BOUNCES, 0)
+NO_BOUNCES = option("bounces", described(precompute)["bounces"].partition("  [")[0], BOUNCES, default=0)
 PLANNED = ("planned", *RECIPES)
 
 
-def systems(names: Sequence[str], words: str, default: str | None = "lobe") -> click.Option:
+def systems(names: Sequence[str], words: str, *, default: str | None = "lobe") -> click.Option:
     """The option --system."""
-    return option("system", words, Several(SystemName(names)), default and (default,))
+    return option("system", words, Several(SystemName(names)), default=default and (default,))
 
 
 def layers(words: str) -> click.Option:
@@ -274,7 +274,7 @@ def layers(words: str) -> click.Option:
 
 def folder(words: str, *, default: str | None = None) -> click.Option:
     """The option --output for a folder."""
-    return option("output", words, click.Path(path_type=Path), default)
+    return option("output", words, click.Path(path_type=Path), default=default)
 
 
 def _defaults(size: str, lobes: int) -> dict[str, int]:
@@ -295,9 +295,9 @@ def sizes(*names: str, lobes: int = Lobes().lobes) -> list[click.Option]:
         text = "; ".join(f"{sentence} [default: {', '.join(values)}]" for sentence, values in words.items())
         text += "; several numbers make several systems" * (name == "lobes")
         result.append(option(name, text, _SIZES[name]))
-    order = option("order", "Bands of spherical harmonics (harmonic); N^2 coefficients.", Range(1, 15), 5)
+    order = option("order", "Bands of spherical harmonics (harmonic); N^2 coefficients.", Range(1, 15), default=5)
     window = "Window against ringing on glossy parts (harmonic)."
-    return [*result, order, option("window", window, click.Choice(list(LAPLACIAN)), "laplacian")]
+    return [*result, order, option("window", window, click.Choice(list(LAPLACIAN)), default="laplacian")]
 
 
 FEW_SIZES = sizes("lobes", "texels", lobes=SHIPPED_LOBES)  # of systems that pages show

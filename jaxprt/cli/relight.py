@@ -44,7 +44,7 @@ class Shard(click.ParamType):
     Light=options.LIGHT,
     Camera=options.options_of(inputs.camera, azimuth=options.DEGREES, elevation=options.ELEVATION, size=options.PIXELS),
     System=[
-        options.systems(options.PLANNED, "One or several systems to compare.  [default: planned]", None),
+        options.systems(options.PLANNED, "One or several systems to compare.  [default: planned]", default=None),
         {"plan": (click.Path(exists=True, path_type=Path, file_okay=False),)},
         *options.PLAN,
     ],

@@ -93,7 +93,7 @@ def make(
     return scene, cost | {part: {"recipe": type(of).__name__, **vars(of)} for part, of in recipes.items()}
 
 
-def pictures(scene: RelitScene, view: View, camera: Camera | None = None) -> Float[np.ndarray, "l h w c"]:
+def pictures(scene: RelitScene, view: View, *, camera: Camera | None = None) -> Float[np.ndarray, "l h w c"]:
     """Pictures under all lights."""
     return scene.pictures(list(view.lights.values()), [camera or view.camera])[:, 0]
 
@@ -155,7 +155,7 @@ def compare(view: View, scenes: dict[str, RelitScene], output: Path) -> dict[str
     truth, mesh, result = exact(view, list(drawn.values())), view.scene.mesh, {}
     camera, alike = truth.picture.camera, drawn
     if camera.width != view.camera.width:
-        alike = {system: pictures(scene, view, camera) for system, scene in direct.items()}
+        alike = {system: pictures(scene, view, camera=camera) for system, scene in direct.items()}
     whole = {system: pictures(scene, view) for system, scene in scenes.items() if scene.bounces is not None}
     cover = image.render(mesh, jnp.ones((len(mesh.position), 1)), camera, background=None)
     uncovered = 1 - next(iter(direct.values())).coverage(view.camera)[..., None]

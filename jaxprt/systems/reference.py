@@ -77,6 +77,7 @@ def radiance(
     brdf = grid.as_argument(brdf)
     for name, value in (("mesh", mesh), ("occluder", occluder), ("vertex", vertex)):
         PRECOMPUTE[name](value)
+    protocol.check_points(points, len(mesh.position))
     light = protocol.one_light(light, batch=True)
     eye = require.position("the eye", origins.local("the eye", eye, mesh.origin))
     if not isinstance(brdf, PerVertex):
