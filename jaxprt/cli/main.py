@@ -18,6 +18,12 @@ from jaxprt.relit import registry
 _INTERRUPTED = 130
 
 
+class Refused(click.ClickException):
+    """Wrong input: what was required, and what was given."""
+
+    exit_code = 2
+
+
 class Program(click.Group):
     """Group of all commands. Errors end a command with a message and an exit status instead of a traceback."""
 
@@ -36,9 +42,7 @@ class Program(click.Group):
             click.echo("jaxprt: stopped; the same command goes on from here", err=True)
             ctx.exit(_INTERRUPTED)
         except (ValueError, TypeError, FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
-            refused = click.ClickException(options.message_of(error))
-            refused.exit_code = 2
-            raise refused from error
+            raise Refused(options.message_of(error)) from error
         except (OSError, RuntimeError, MemoryError) as error:
             raise click.ClickException(options.message_of(error)) from error
 

@@ -326,13 +326,14 @@ def recipes(system: str, chosen: SimpleNamespace, *, lobes: int = Lobes().lobes)
         return {system: Harmonics(chosen.order - 1, LAPLACIAN[chosen.window])}
     recipe, sizes = RECIPES[system], {name: getattr(chosen, name, None) for name in _SIZES if name != "lobes"}
     values = {name: value for name, value in sizes.items() if value is not None and hasattr(recipe(), name)}
-    if system not in _defaults("lobes", lobes):
+    if system not in _defaults("lobes", lobes):  # those with lobes are `Lobes` and `Dynamic`
         return {system: recipe(**values)}
     counts = chosen.lobes or (_defaults("lobes", lobes)[system],)
     names = [system] if len(counts) == 1 else [f"{system}_{count}" for count in counts]
     # Tensors are shipped for the default number of lobes.
     without = {count: {"ranks": None} if system == "dynamic" and count != Dynamic().lobes else {} for count in counts}
-    return {name: recipe(lobes=count, **without[count], **values) for name, count in zip(names, counts, strict=True)}
+    made: Callable[..., Recipe] = recipe
+    return {name: made(lobes=count, **without[count], **values) for name, count in zip(names, counts, strict=True)}
 
 
 def recipe(chosen: SimpleNamespace, what: str) -> Recipe:

@@ -258,9 +258,8 @@ class RelitScene(System):
         for number, (surface, look) in enumerate(zip(stage.surfaces, looks, strict=True)):
             in_scene, on_group = self._points(number, stage, points)
             blend, emitted = jax.tree.map(on_group.carry, (look.blend, look.emitted))
-            sharp = None
-            if number in stage.sharp_groups:
-                sharp = stage.sharp_at(number, in_scene)
+            sharp = stage.sharp_at(number, in_scene)
+            if sharp is not None:
                 if on_group.all_vertices:
                     with compile_time(self.mesh, eye):
                         sharp = sharp * tracing.facing(self.mesh, eye)[in_scene.corner[0]] * self._real(number)

@@ -22,39 +22,36 @@ class Points(eqx.Module):
     """Points on the triangles of a mesh, in barycentric coordinates; without any, all vertices in their order.
 
     Attributes:
-        corner: Vertex indices of each point's triangle; None for all vertices.
-        weight: Barycentric coordinates, which sum to 1; None for all vertices.
+        corner: Vertex indices of each point's triangle.
+        weight: Barycentric coordinates, which sum to 1.
         slope: Change of the barycentric coordinates from one pixel to the next, to the right and down; None for points
             that do not belong to a picture.
         normal: Unit shading normals in world space, where normal maps tilt them; None for those of the vertices,
             interpolated.
+        all_vertices: Whether the points are all vertices, to which nothing is interpolated.
     """
 
-    corner: Int[Array | np.ndarray, "k p"] | None = None
-    weight: Float[Array | np.ndarray, "k p"] | None = None
+    corner: Int[Array | np.ndarray, "k p"]
+    weight: Float[Array | np.ndarray, "k p"]
     slope: Float[Array | np.ndarray, "2 k p"] | None = None
-    normal: Float[Array | np.ndarray, "3 p"] | None = None
-
-    @property
-    def all_vertices(self) -> bool:
-        """Whether these are all vertices, so that nothing is interpolated."""
-        return self.corner is None
+    normal: Float[Array | np.ndarray, "3 n"] | None = None
+    all_vertices: bool = eqx.field(static=True, default=False)
 
     def __len__(self) -> int:
         """Number of points that are not all vertices."""
-        return np.shape(self.corner)[1]
+        return self.corner.shape[1]
 
     def count(self, vertices: int) -> int:
         """Number of points on a mesh with a number of vertices."""
-        return vertices if self.corner is None else len(self)
+        return vertices if self.all_vertices else len(self)
 
     def corners(self, vertices: int) -> Int[Array | np.ndarray, "k p"]:
         """The vertices from which each point is interpolated: itself alone if these are all vertices."""
-        return np.arange(vertices, dtype=np.int32)[None] if self.corner is None else self.corner
+        return np.arange(vertices, dtype=np.int32)[None] if self.all_vertices else self.corner
 
-    def carry(self, attribute: Num[Array | np.ndarray, "..."], *, axis: int = 0) -> Num[Array | np.ndarray, "..."]:
+    def carry(self, attribute: Num[Array | np.ndarray, "..."], *, axis: int = 0) -> Num[Array, "..."]:
         """Interpolates a vertex attribute at the points. The vertices are along `axis`; the result is linear in it."""
-        return attribute if self.corner is None else _carry(self.corner, self.weight, attribute, axis=axis)
+        return jnp.asarray(attribute) if self.all_vertices else _carry(self.corner, self.weight, attribute, axis=axis)
 
     def slopes(self, attribute: Float[Array | np.ndarray, "v c"]) -> Float[Array, "2 p c"]:
         """Change of a vertex attribute from one pixel to the next, to the right and down."""
@@ -67,7 +64,7 @@ class Points(eqx.Module):
 
     def check(self, vertices: int) -> None:
         """Refuses points that refer to missing vertices or lie outside of their triangles; not inside of `jax.jit`."""
-        if self.corner is None and self.weight is None:
+        if self.all_vertices:
             return
         shapes = list(np.shape(self.corner)), list(np.shape(self.weight))
         if len(shapes[0]) != 2 or shapes[0] != shapes[1]:
@@ -80,7 +77,7 @@ class Points(eqx.Module):
                 worst = int(np.argmax(np.abs(total - 1)))
                 raise ValueError(f"the weights of points must sum to 1, got {total[worst]:g} at point {worst}")
 
-    def frame(self, frame: Float[Array | np.ndarray, "v 3 3"]) -> Float[Array | np.ndarray, "p 3 3"]:
+    def frame(self, frame: Float[Array | np.ndarray, "v 3 3"]) -> Float[Array, "p 3 3"]:
         """Shading frames at the points: normals are interpolated and normalized, tangents made orthogonal to them.
 
         Points with normals of their own have these in place of the interpolated ones.
@@ -88,10 +85,11 @@ class Points(eqx.Module):
         Args:
             frame: Shading frames of the vertices; rows are tangent, bitangent, normal.
         """
-        return frame if self.corner is None and self.normal is None else _frames(self, frame)
+        return jnp.asarray(frame) if self.all_vertices and self.normal is None else _frames(self, frame)
 
 
-VERTICES = Points()  # all vertices of any mesh
+# All vertices of any mesh.
+VERTICES = Points(np.zeros((0, 0), np.int32), np.zeros((0, 0), np.float32), all_vertices=True)
 
 
 @partial(jit, static_argnames="axis")
@@ -116,7 +114,7 @@ def _frames(points: Points, frame: Array) -> Array:
 
 def placed(
     position: Float[Array | np.ndarray, "v 3"], frame: Float[Array | np.ndarray, "v 3 3"], points: Points
-) -> tuple[Float[Array | np.ndarray, "p 3"], Float[Array | np.ndarray, "p 3 3"]]:
+) -> tuple[Float[Array, "p 3"], Float[Array, "p 3 3"]]:
     """Positions and shading frames of points."""
     return points.carry(position), points.frame(frame)
 

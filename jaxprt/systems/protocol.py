@@ -437,8 +437,11 @@ class Total(System):
         """The sum of the radiance of all systems."""
         require.kind("the light", light, tuple, source="Total.light")
         require.kind("the view", view, tuple, source="Total.view")
-        parts = (system.combine(*sides, points) for system, *sides in zip(self.part, light, view, strict=True))
-        return sum(parts, start=jnp.zeros((), jnp.result_type(float)))
+        parts = zip(self.part, light, view, strict=True)
+        return sum(
+            (system.combine(lit, seen, points) for system, lit, seen in parts),
+            start=jnp.zeros((), jnp.result_type(float)),
+        )
 
     @property
     def vertices(self) -> int:

@@ -243,7 +243,7 @@ def trace(query, rows):
     """Traces the valid ones of sixteen rays, from `Triangles.rays`, which have `RAY` or `RAY_HIT` rows."""
     ray, valid, _, (address, width, scene, arguments, _, _) = query
     if width == 16:
-        _call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)
+        _call(address, valid.ctypes.data, scene, ray.ctypes.data, arguments.ctypes.data)  # pyright: ignore[reportCallIssue]
     elif width == 8:
         _trace_parts(query, rows, 8)
     else:
@@ -264,7 +264,7 @@ def _trace_parts(query, rows, width):
         for row in range(rows):
             for lane in range(width):
                 packet[row * width + lane] = ray[row, first + lane]
-        _call(address, chosen.ctypes.data, scene, packet.ctypes.data, arguments.ctypes.data)
+        _call(address, chosen.ctypes.data, scene, packet.ctypes.data, arguments.ctypes.data)  # pyright: ignore[reportCallIssue]
         for row in range(FAR, rows):  # before it stand the origin and the direction
             for lane in range(width):
                 ray[row, first + lane] = packet[row * width + lane]

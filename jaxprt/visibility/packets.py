@@ -270,7 +270,7 @@ def _wrap(coordinate, mode):
 @numba_loop
 def _alpha(address, face, u, v):
     """The opacity of a point: 0 or 1 for a surface with holes, the share of light that it stops for others."""
-    table = carray(embree.pointer(address), 1, _TABLE)[0]
+    table = carray(embree.pointer(address), 1, _TABLE)[0]  # pyright: ignore[reportCallIssue]
     corner = carray(embree.pointer(table.corners), face + 1, _CORNERS)[face]
     image = carray(embree.pointer(table.image), corner.layer + 1, _IMAGE)[corner.layer]
     coordinate, factor, wrap = corner.coordinate, corner.factor, image.wrap
@@ -318,7 +318,7 @@ def _insert(layer, count, distance, face, alpha):
 def _filter_hits(argument):
     """Refuses hits where light passes: the function that Embree calls."""
     call = carray(argument, 1, _FILTER)[0]
-    context, lanes = carray(embree.pointer(call.context), 1, _CONTEXT)[0], np.int64(call.count)
+    context, lanes = carray(embree.pointer(call.context), 1, _CONTEXT)[0], np.int64(call.count)  # pyright: ignore[reportCallIssue]
     valid = carray(embree.pointer(call.valid), lanes, np.int32)
     ray = carray(embree.pointer(call.ray), (embree.RAY, lanes), np.float32)
     number = carray(embree.pointer(call.ray), (embree.RAY, lanes), np.uint32)

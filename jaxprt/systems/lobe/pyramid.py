@@ -104,7 +104,7 @@ class LobeTransport(eqx.Module):
         face, s, t, spread = (_blocks(array) for array in (face, s, t, spread))
         down, right, bit = _addresses(face, s, t, spread, size=self.size)
         read = tuple(_bytes(self.pyramid, _blocks(row[None]), down, right) for row in points.corners(count))
-        weight = None if points.weight is None else _blocks(points.weight.astype(spread.dtype))
+        weight = None if points.all_vertices else _blocks(points.weight.astype(spread.dtype))
         seen, by_s, by_t = _decode(read, weight, bit, s, t, spread, size=self.size)
         return _columns(seen, count), _columns(by_s, count), _columns(by_t, count)
 
