@@ -304,7 +304,7 @@ class _PicturePoints(NamedTuple):
         """The points of some indices, all of one part."""
         corner = self.face[np.asarray(self.pixels.triangle)[index]] - self.first[part]
         weight, slope = (np.asarray(column)[index] for column in (self.pixels.barycentric, self.pixels.slope))
-        return Points(*map(jnp.asarray, (corner.T, weight.T, np.moveaxis(slope, 0, -1))))
+        return Points(jnp.asarray(corner.T), jnp.asarray(weight.T), jnp.asarray(np.moveaxis(slope, 0, -1)))
 
 
 def _choose_places(covered: np.ndarray, count: int) -> np.ndarray:
