@@ -332,8 +332,10 @@ def recipes(system: str, chosen: SimpleNamespace, *, lobes: int = Lobes().lobes)
     names = [system] if len(counts) == 1 else [f"{system}_{count}" for count in counts]
     # Tensors are shipped for the default number of lobes.
     without = {count: {"ranks": None} if system == "dynamic" and count != Dynamic().lobes else {} for count in counts}
-    made: Any = recipe
-    return {name: made(lobes=count, **without[count], **values) for name, count in zip(names, counts, strict=True)}
+    with_lobes: Any = recipe
+    return {
+        name: with_lobes(lobes=count, **without[count], **values) for name, count in zip(names, counts, strict=True)
+    }
 
 
 def recipe(chosen: SimpleNamespace, what: str) -> Recipe:
