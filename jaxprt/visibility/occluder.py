@@ -73,7 +73,7 @@ class Occluder:
     def _packets(self, **options: bool):
         from jaxprt.visibility.packets import Packets  # numba takes half a second to import
 
-        return Packets(self.position, self.face, self.opacity, **options)
+        return Packets(self.position, self.face, opacity=self.opacity, **options)
 
     def packets(self) -> Any:
         """The Embree scene for packets of rays, as `jaxprt.visibility.packets.Packets`."""

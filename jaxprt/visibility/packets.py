@@ -58,8 +58,8 @@ class Packets(embree.Triangles):
         self,
         position: Float32[np.ndarray, "v 3"],
         face: Integer[np.ndarray, "f 3"],
-        opacity: Opacity | None,
         *,
+        opacity: Opacity | None = None,
         clear_only: bool = False,
     ):
         library = embree.library()
