@@ -63,11 +63,11 @@ def command(
     """A decorator that makes a command of a function from options to a result, which the command prints.
 
     Args:
-        name: Its name.
-        short_help: Its line in the list of commands.
-        arguments: What is given without the name of an option.
-        groups: Options by the title of their section in the help; in place of some, a dictionary from their names to
-            the type and the default. The function's docstring then describes them.
+        name: The word that users type after `jaxprt`.
+        short_help: Sentence that `jaxprt --help` prints beside the word.
+        arguments: Arguments that users give by position.
+        groups: Options by the title of their section in the help. A dictionary in the list maps names of options to
+            their types and defaults; the function's docstring describes these options.
     """
 
     def decorate(function: Callable[[SimpleNamespace], Result | None]) -> Command:

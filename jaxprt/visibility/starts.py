@@ -83,7 +83,7 @@ def inside(
     other = np.cross(out, side)
     for x, y, z in local:
         way = x * side[hidden] + y * other[hidden] + z * out[hidden]
-        # Of the two sides of a sheet no ray hits a back.
+        # Where two faces coincide, `facing_hit` returns the front, so that rays count no backs on sheets.
         triangle, distance, _ = occluder.facing_hit(start[hidden], way)
         behind[hidden] += occluder.hits_back(triangle, way) & (triangle >= 0)
         if z > _STEEP:
