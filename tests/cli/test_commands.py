@@ -21,19 +21,19 @@ from jaxprt.cli.main import program
 
 def test_a_plan_is_printed_and_kept_and_relights(main, place, tmp_path, monkeypatch, capsys):
     files = [place / "sun.exr", place / "mesh.obj", "--brdf", "lambert"]
-    given = [*files, "--light-size", "8"]
-    kept = ["--error", "0.5", "--output", tmp_path / "kept"]
-    assert main("plan", *given, *kept) == 0
+    arguments = [*files, "--light-size", "8"]
+    target = ["--error", "0.5", "--output", tmp_path / "kept"]
+    assert main("plan", *arguments, *target) == 0
     table = capsys.readouterr().out
     assert "error asked 50 %, 30 frames per second\nmesh: 4 vertices" in table
     monkeypatch.setattr(planned, "plan", None)  # Nothing is planned again.
-    assert main("plan", *given, *kept, "--json") == 0
+    assert main("plan", *arguments, *target, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["groups"][0]["parts"] == list(told["reflected"]) == ["mesh"]
     chosen = told["groups"][0]["chosen"]["recipe"]
     assert f"* {100 * told['error']:6.1f} %" in table
     assert chosen["system"] == "Harmonics"
-    assert main("plan", *given, "--error", "0.4", "--output", tmp_path / "kept") == 2
+    assert main("plan", *arguments, "--error", "0.4", "--output", tmp_path / "kept") == 2
     assert "kept/plan was made for another scene, lights, error or rate" in capsys.readouterr().err
     made = []
 
@@ -47,7 +47,7 @@ def test_a_plan_is_printed_and_kept_and_relights(main, place, tmp_path, monkeypa
     assert vars(recipe["mesh"]) == {name: value for name, value in chosen.items() if name != "system"}
     assert view.lights["sun"].radiance.shape[-2] == 8  # the plan's size
     assert options["bounces"] == told["bounces"]
-    assert main("relight", *given, "--plan", place, "--output", tmp_path / "out") == 2
+    assert main("relight", *arguments, "--plan", place, "--output", tmp_path / "out") == 2
     assert "--plan must be a folder of `jaxprt plan`" in capsys.readouterr().err
 
 
@@ -60,8 +60,8 @@ def test_a_planned_scene_names_its_recipes(place, tmp_path):
 
 
 def test_a_scene_is_measured_as_its_report_says(main, place, tmp_path, capsys):
-    given = [place / "mesh.obj", place / "sun.exr", "--light-size", "8", "--brdf", "ggx:roughness=.6"]
-    assert main("measure", *given, "--lobes", "1,2", "--output", tmp_path, "--json") == 0
+    arguments = [place / "mesh.obj", place / "sun.exr", "--light-size", "8", "--brdf", "ggx:roughness=.6"]
+    assert main("measure", *arguments, "--lobes", "1,2", "--output", tmp_path, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert list(told["systems"]) == ["lobe_1", "lobe_2"]  # from rays that are traced once
     lobes = told["systems"]["lobe_2"]
@@ -73,8 +73,8 @@ def test_a_scene_is_measured_as_its_report_says(main, place, tmp_path, capsys):
 
 
 def test_the_fit_of_a_brdf_is_measured_on_a_sphere(main, place, capsys):
-    given = ["--fit", "cook-torrance:roughness=.4", place / "sun.exr", "--light-size", "8", "--system", "lobe"]
-    assert main("measure", *given, "--json") == 0
+    arguments = ["--fit", "cook-torrance:roughness=.4", place / "sun.exr", "--light-size", "8", "--system", "lobe"]
+    assert main("measure", *arguments, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["material"]["model"] == "CookTorrance"
     error = {(row["lobes"], row["texels"]): row["error sun"] for row in told["rows"]}
@@ -177,12 +177,12 @@ def test_environments_are_told_by_their_content_where_the_suffix_says_nothing(pl
 
 
 def test_without_files_there_are_the_chess_pieces_whose_materials_are_named_or_numbered(chosen):
-    given = chosen("--material", "2=ward", "--material", "pieces=metallic-roughness:roughness=.3")
-    parts = options.call(inputs.scene, given, playable=True).parts
+    parsed = chosen("--material", "2=ward", "--material", "pieces=metallic-roughness:roughness=.3")
+    parts = options.call(inputs.scene, parsed, playable=True).parts
     assert [part.name for part in parts] == ["pieces", "light squares", "dark squares"]
     assert [type(part.material).__name__ for part in parts] == ["TexturedMaterial", "TexturedMaterial", "Ward"]
     assert parts[0].material.roughness == np.float32(0.3)
-    assert list(options.call(inputs.lights, given, light_size=8)) == ["daylight", "studio"]
+    assert list(options.call(inputs.lights, parsed, light_size=8)) == ["daylight", "studio"]
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

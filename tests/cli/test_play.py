@@ -17,11 +17,11 @@ from jaxprt.view.progress import Progress
 
 
 def test_files_are_told_by_their_names_and_parts_without_a_material_are_plastic(chosen, place):
-    given = chosen(*(place / name for name in ("mesh.obj", "sky.exr", "two.obj")), "--ground")
-    scene = options.call(inputs.scene, given, playable=True)
+    parsed = chosen(*(place / name for name in ("mesh.obj", "sky.exr", "two.obj")), "--ground")
+    scene = options.call(inputs.scene, parsed, playable=True)
     assert len({part.name for part in scene.parts}) == 3
     assert [float(part.material.specular) for part in scene.parts] == [1, 1, 0]
-    assert list(options.call(inputs.lights, given, light_size=8)) == ["sky"]
+    assert list(options.call(inputs.lights, parsed, light_size=8)) == ["sky"]
 
 
 def test_the_first_camera_frames_the_object_and_not_the_ground_below(place):
@@ -51,9 +51,9 @@ def test_previews_divided_meshes_and_systems_are_one_way(chosen, place, monkeypa
 
 def test_a_page_a_baked_scene_and_probes_are_written(main, place, tmp_path, capsys):
     out = [tmp_path / name for name in ("piece.html", "baked.glb", "probes.json")]
-    given = [place / "mesh.obj", place / "gray.exr", "--light-size", "8", "--lobes", "1", "--error", "0.15"]
+    arguments = [place / "mesh.obj", place / "gray.exr", "--light-size", "8", "--lobes", "1", "--error", "0.15"]
     written = [word for path in out for word in ("--output", path)]
-    assert main("export", *given, *written, "--json", "--tool", "three.js,unity") == 0
+    assert main("export", *arguments, *written, "--json", "--tool", "three.js,unity") == 0
     told = json.loads(capsys.readouterr().out)
     assert [row["kind"] for row in told] == ["page", "baked", "probes"]
     assert [row["bytes"] for row in told] == [path.stat().st_size for path in out]
@@ -68,8 +68,8 @@ def test_a_page_a_baked_scene_and_probes_are_written(main, place, tmp_path, caps
 
 def test_a_scene_with_transfer_is_written(main, place, tmp_path, capsys):
     out = tmp_path / "prt.glb"
-    given = [place / "mesh.obj", place / "gray.exr", "--light-size", "8", "--lobes", "1"]
-    assert main("export", *given, "--format", "gltf", "--degree", "2", "--output", out) == 0
+    arguments = [place / "mesh.obj", place / "gray.exr", "--light-size", "8", "--lobes", "1"]
+    assert main("export", *arguments, "--format", "gltf", "--degree", "2", "--output", out) == 0
     assert "with transfer of degree 2 in vertex attributes, and lights gray" in capsys.readouterr().out
     data = out.read_bytes()
     head = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
@@ -136,8 +136,8 @@ def test_the_page_of_files_is_served(main, place, tmp_path, monkeypatch, capsys)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(prt.view.Server, "wait", look)
-    given = [place / "mesh.obj", place / "sky.exr", "--lobes", "1,2", "--light-size", "8"]
-    assert main("view", *given, "--output", tmp_path) == 0
+    arguments = [place / "mesh.obj", place / "sky.exr", "--lobes", "1,2", "--light-size", "8"]
+    assert main("view", *arguments, "--output", tmp_path) == 0
     assert answers[0]["lights"] == ["sky"]
     assert list(answers[0]["systems"]) == ["1 lobes", "2 lobes"]
     assert answers[0]["vertices"] == 4
@@ -204,15 +204,15 @@ def test_what_cannot_be_shown_is_an_error(argument, words, main, capsys):
 def test_a_page_far_from_the_scene_is_refused_with_the_cause_and_written_where_its_error_is_accepted(
     main, data, tmp_path, capsys
 ):
-    given = [data / "foreign/craft_speederD.gltf", data / "env/polyhaven_spiaggia_di_mondello_1k.hdr"]
+    arguments = [data / "foreign/craft_speederD.gltf", data / "env/polyhaven_spiaggia_di_mondello_1k.hdr"]
     page, sizes = tmp_path / "ship.html", ["--light-size", "8", "--lobes", "1", "--refine", "off"]
-    assert main("export", *given, *sizes, "--output", page) == 2
+    assert main("export", *arguments, *sizes, "--output", page) == 2
     told = capsys.readouterr().err
     assert "error must be at least 0." in told
     assert "for this page, got 0.05: its pictures are" in told
     assert "in the light 'polyhaven_spiaggia_di_mondello_1k'" in told
     assert "% by edges of shadows that lie between vertices: divide the meshes finer (refine)" in told
     assert not page.exists()
-    assert main("export", *given, *sizes, "--output", page, "--error", "1") == 0
+    assert main("export", *arguments, *sizes, "--output", page, "--error", "1") == 0
     assert page.exists()
     assert "edges of shadows that lie between vertices" in capsys.readouterr().out

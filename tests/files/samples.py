@@ -28,8 +28,8 @@ def planes(image, names="RGB", prefix=""):
 def write_parts(path, **parts):
     """An EXR file of parts, each its channels and more of its header."""
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    made = [OpenEXR.Part(header | more, dict(channels), name) for name, (channels, more) in parts.items()]
-    with OpenEXR.File(made) as file:
+    images = [OpenEXR.Part(header | more, dict(channels), name) for name, (channels, more) in parts.items()]
+    with OpenEXR.File(images) as file:
         file.write(str(path))
 
 

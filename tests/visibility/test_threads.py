@@ -76,16 +76,16 @@ def tracers() -> dict[str, Callable[[], bytes]]:
 
 def library(config: str, width: int | None = None) -> embree.Embree:
     """The library with a device for an instruction set, and with packets of a width that it may not trace as such."""
-    own = embree.library()
-    assert own is not None
-    found = embree.Embree.on(own.functions, config.encode())
+    installed = embree.library()
+    assert installed is not None
+    found = embree.Embree.on(installed.functions, config.encode())
     if found is None:
         pytest.skip(f"this processor has not what {config} asks for")
     if width is None:
         return found
     named = {"occluded": f"rtcOccluded{width}", "intersect": f"rtcIntersect{width}"}
     query = {
-        field: (ctypes.cast(getattr(own.functions, name), ctypes.c_void_p).value, width)
+        field: (ctypes.cast(getattr(installed.functions, name), ctypes.c_void_p).value, width)
         for field, name in named.items()
     }
     return found._replace(**query)
