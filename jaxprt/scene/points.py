@@ -19,7 +19,7 @@ _ROUNDED = 1e-4  # tolerance of barycentric coordinates
 
 
 class Points(eqx.Module):
-    """Points on the triangles of a mesh, in barycentric coordinates; without any, all vertices in their order.
+    """Points on the triangles of a mesh, in barycentric coordinates; or, as `VERTICES`, all vertices in their order.
 
     Attributes:
         corner: Vertex indices of each point's triangle.
