@@ -935,8 +935,8 @@ def bound(name: str, arrays: Call) -> dict[str, Any]:
 
 
 def floats(tree: Any) -> list:
-    """Floating-point arrays in a tree."""
-    return [leaf for leaf in jax.tree.leaves(tree) if is_float(leaf)]
+    """Floating-point arrays in a tree that hold numbers: those of `VERTICES` hold none."""
+    return [leaf for leaf in jax.tree.leaves(tree) if is_float(leaf) and np.size(leaf)]
 
 
 def is_float(leaf: Any) -> bool:

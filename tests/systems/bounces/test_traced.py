@@ -91,11 +91,11 @@ def test_what_is_traced_changes_smoothly_with_the_width():
 
 def test_what_the_eye_cannot_see_stays_with_the_harmonics(close):
     own, half = part(), jnp.asarray(np.arange(POINTS) % 2, jnp.float32)
-    rays = own.rays(EYE, blend(0.06).parameter, None, half)
+    rays = own.rays(EYE, blend(0.06).parameter, seen=half)
     assert np.all(np.asarray(rays.chance)[:, ::2] == 0)
-    weight = own.weights(rays, EYE, blend(0.06), None, half)
+    weight = own.weights(rays, EYE, blend(0.06), seen=half)
     assert np.all(np.asarray(weight)[:, ::2] == 0)
-    view = own.view(EYE, blend(0.06), None, half)
+    view = own.view(EYE, blend(0.06), seen=half)
     close(view[..., ::2], own.harmonics_alone.view(EYE, blend(0.06))[..., ::2])
     close(view[..., 1::2], own.view(EYE, blend(0.06))[..., 1::2])
 
