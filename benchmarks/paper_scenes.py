@@ -378,7 +378,7 @@ def _darker(made: Made, amount: float) -> Look:
 
 def light_of(made: Made, size: int | None = None) -> Environment:
     """The light of a scene; in texels of its size, unless another one is given."""
-    name, size = made.recipe.light, size or made.scene.surfaces[0].system.texel_edge
+    name, size = made.recipe.light, size or made.scene.surfaces[0].system.light_size
     assert size is not None
     path = harness.data() / "env" / name
     return load_environment(path, size=size) if path.is_file() else builtin.daylight(size=size)

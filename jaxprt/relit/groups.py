@@ -27,6 +27,7 @@ from jaxprt.scene.mesh import frames, join
 from jaxprt.scene.points import VERTICES, Points
 from jaxprt.systems import protocol
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart
+from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.lamps import LitByLamps
 from jaxprt.systems.protocol import Blend, System
 
@@ -90,8 +91,13 @@ class Surface(eqx.Module):
 
 def sampled(surface: Surface, samples: int) -> Surface:
     """The surface with another number of sample points along the edge of each bright texel."""
-    system = surface.system.with_samples(samples)
-    return surface if system is surface.system else dataclasses.replace(surface, system=system)
+
+    def changed(part: Any) -> Any:
+        fixed = not isinstance(part, BrightTexels) or part.samples in (None, samples)
+        return part if fixed else dataclasses.replace(part, samples=samples)
+
+    system = jax.tree.map(changed, surface.system, is_leaf=lambda part: isinstance(part, BrightTexels))
+    return dataclasses.replace(surface, system=system)
 
 
 class VertexMaterials(eqx.Module):
@@ -458,8 +464,8 @@ def surface(
     scale = None
     if shading.scale is not None and shading.blend is not None:
         scale = jax.device_put(np.asarray(shading.scale, dtype))
-    if system.placement is not None:
-        position, frame = put(system.placement)
+    if (seen := system.texel_visibility) is not None:
+        position, frame = put((seen.position, seen.frame))
     else:
         pairs = [
             (np.asarray(part.mesh.position, dtype), frames(part.mesh.normal, part.mesh.tangent)) for part in members

@@ -132,7 +132,7 @@ def make(
         if shading.matte:
             groups.append(LitByLamps(transport, albedo=shading.albedo))
         else:
-            groups.append(LitByLamps(transport, system.lobe_table or lobe_table(shading, _LOBES)))
+            groups.append(LitByLamps(transport, lobe_table(shading, _LOBES, system)))
     area = tuple(np.asarray(areas(shadings[number].mesh), jnp.result_type(float)) for number in emitting)
     return SceneLamps(tuple(groups), tuple(emitting), area, point_lights)
 

@@ -441,8 +441,11 @@ def samples_of(shading: Shading, size: int) -> int:
     return bright_texels.samples_for(sharpest, size=size)
 
 
-def lobe_table(shading: Shading, lobes: int) -> lobe.LobeBrdf:
-    """The BRDF of a part as a table of lobes, over roughness if that varies."""
+def lobe_table(shading: Shading, lobes: int, system: System | None = None) -> lobe.LobeBrdf:
+    """The BRDF of a part as a table of lobes, over roughness if that varies: that of its system where it has one."""
+    rest = system.system if isinstance(system, bright_texels.BrightTexels) else system
+    if isinstance(rest, lobe.LobeSystem):
+        return rest.brdf
     if shading.table is not None:
         counts = shading.table.counts
         return shading.table.lobes(lobes if lobes in counts else min(counts, key=lambda count: abs(count - lobes)))

@@ -135,7 +135,7 @@ def _lobes(shadings: Sequence[Shading], system: System) -> LobeBrdf | None:
     """The BRDF of a group as lobes if some of its parts are sharp, or may become so; None for other groups."""
     if shadings[0].matte:
         return None
-    table = system.lobe_table or lobe_table(shadings[0], _LOBES)
+    table = lobe_table(shadings[0], _LOBES, system)
     return table if shadings[0].table is not None or any(is_sharp(part, table) for part in shadings) else None
 
 
@@ -219,7 +219,8 @@ def traits(shading: Shading, surface: Surface) -> tuple[float, int, bool]:
         shading: The part with its material.
         surface: The group that the part belongs to.
     """
-    size = surface.system.texel_edge or _TEXELS
+    seen = surface.system.texel_visibility
+    size = _TEXELS if seen is None else seen.size
     # Powers of two, so that few programs are compiled for parts of different roughness.
     samples = 1 << (samples_of(shading, size) - 1).bit_length()
     lobes = None if surface.reflecting is None else surface.reflecting.lobe

@@ -97,14 +97,15 @@ class BrightTexels(VertexSystem):
         brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions. With a `Blend`, its channels must be those of
             the system.
         count: Number of texels that are summed exactly.
-        samples: Number of sample points along the edge of each texel, from `samples_for`.
+        samples: Number of sample points along the edge of each texel, from `samples_for`; None for its center, whatever
+            the material.
     """
 
     system: System
     visibility: Any
     brdf: Callable
     count: int = eqx.field(static=True, default=16)
-    samples: int = eqx.field(static=True, default=1)
+    samples: int | None = eqx.field(static=True, default=1)
 
     def __check_init__(self):
         """Refuses arguments that are not a system or visibility, and visibility of other vertices."""
@@ -138,7 +139,7 @@ class BrightTexels(VertexSystem):
     def view(self, eye: Float[Array, "*p 3"], materials: PyTree = None, points: Points = VERTICES) -> BrightView:
         """The view of the underlying system, and the frames and directions for which the bright texels are summed."""
         rest = self.system.view(eye, materials, points)
-        position, frame = placed(*self.placement, points)
+        position, frame = placed(self.visibility.position, self.visibility.frame, points)
         eye = require.position("the eye", eye, points=len(position))
         return BrightView(rest, frame, directions.view(frame, position, eye), materials)
 
@@ -150,7 +151,7 @@ class BrightTexels(VertexSystem):
         if light.flux is not None:
             return rest + self._diffuse(light.flux, view, points).T * self.system.diffuse_albedo(view.rest)
         texels = light.texel, light.excess / LEVELS, light.seen
-        options = {"size": self.visibility.size, "samples": self.samples}
+        options = {"size": self.visibility.size, "samples": self.samples or 1}
         brdf = grid.as_argument(self.brdf)
         return rest + texel_radiance(brdf, view.frame, view.wo, texels, points, view.blend, **options)
 
@@ -183,11 +184,6 @@ class BrightTexels(VertexSystem):
         return self.system.vertices
 
     @property
-    def lobe_table(self) -> Any:
-        """The lobes of the underlying system."""
-        return self.system.lobe_table
-
-    @property
     def lobe_part(self) -> Any:
         """The lobes of the underlying system, which can be widened."""
         return self.system.lobe_part
@@ -203,16 +199,6 @@ class BrightTexels(VertexSystem):
         return self.visibility.size
 
     @property
-    def texel_edge(self) -> int:
-        """Edge of the cubemap faces."""
-        return self.visibility.size
-
-    @property
-    def placement(self) -> tuple[Array | np.ndarray, Array | np.ndarray]:
-        """Positions and frames of the vertices."""
-        return self.visibility.position, self.visibility.frame
-
-    @property
     def texel_visibility(self) -> Any:
         """The visibility of single texels."""
         return self.visibility
@@ -220,10 +206,6 @@ class BrightTexels(VertexSystem):
     def exported(self, what: str) -> protocol.Exported:
         """That of the underlying system."""
         return self.system.exported(what)
-
-    def with_samples(self, samples: int) -> "BrightTexels":
-        """The system with another number of sample points along the edge of each bright texel."""
-        return self if samples == self.samples else dataclasses.replace(self, samples=samples)
 
     @property
     def growing(self) -> PyTree:

@@ -135,11 +135,6 @@ class System(eqx.Module):
         return None
 
     @property
-    def lobe_table(self) -> Any:
-        """The BRDF as a `jaxprt.lobe.LobeBrdf`; None if the system has another form of it."""
-        return None
-
-    @property
     def lobe_part(self) -> Any:
         """The `jaxprt.lobe.LobeSystem` whose lobes `view` widens by a variance; None if it has none.
 
@@ -163,23 +158,9 @@ class System(eqx.Module):
         return 1
 
     @property
-    def texel_edge(self) -> int | None:
-        """Edge of the cubemap faces whose brightest texels are summed exactly; None if none are."""
-        return None
-
-    @property
-    def placement(self) -> tuple[Array | np.ndarray, Array | np.ndarray] | None:
-        """Positions and frames of the vertices, where the system holds them for the sum over bright texels."""
-        return None
-
-    @property
     def texel_visibility(self) -> Any:
         """Visibility of the single texels whose light is summed exactly, as `BrightTexels` has it; None without."""
         return None
-
-    def with_samples(self, samples: int) -> "System":
-        """The system with another number of sample points along the edge of each bright texel."""
-        return self
 
     def exported(self, what: str) -> "Exported":
         """What an exported page holds of the system. Systems without a form of their own can return another system's.

@@ -280,18 +280,10 @@ def _base_shading(shading: Shading) -> Shading:
     )
 
 
-class CentralTexels(BrightTexels):
-    """A system that samples bright texels at their centers, also for a BRDF that varies over a texel."""
-
-    def with_samples(self, samples: int) -> "CentralTexels":
-        """The same system."""
-        return self
-
-
-def _with_texels(system: System, seen: Any, part: Exported, shading: Shading) -> CentralTexels:
+def _with_texels(system: System, seen: Any, part: Exported, shading: Shading) -> BrightTexels:
     """A system that sums the brightest texels of the light one by one, each at its center."""
     brdf = part.texel_brdf(shading.brdf) if shading.blend is None else shading.brdf
-    return CentralTexels(system, seen, brdf, count=texels_of(seen.size))
+    return BrightTexels(system, seen, brdf, count=texels_of(seen.size), samples=None)
 
 
 def texels_of(size: int) -> int:

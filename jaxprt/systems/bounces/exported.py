@@ -8,7 +8,6 @@ it for environments of low harmonics, and one more row holds the light of lamps.
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxprt import require
@@ -81,15 +80,6 @@ class ReflectingSystem(VertexSystem):
         return self.direct.matte
 
     @property
-    def texel_edge(self) -> int | None:
+    def texel_visibility(self) -> PyTree:
         """That of the system of direct light."""
-        return self.direct.texel_edge
-
-    @property
-    def placement(self) -> tuple[Array | np.ndarray, Array | np.ndarray] | None:
-        """That of the system of direct light."""
-        return self.direct.placement
-
-    def with_samples(self, samples: int) -> "ReflectingSystem":
-        """The same with another number of sample points along the edge of each bright texel."""
-        return eqx.tree_at(lambda system: system.direct, self, self.direct.with_samples(samples))
+        return self.direct.texel_visibility

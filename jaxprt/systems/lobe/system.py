@@ -145,11 +145,6 @@ class LobeSystem(protocol.VertexSystem):
         return CoarseLobes(transport, self.brdf)
 
     @property
-    def lobe_table(self) -> LobeBrdf:
-        """The BRDF."""
-        return self.brdf
-
-    @property
     def lobe_part(self) -> "LobeSystem":
         """The system itself."""
         return self
