@@ -29,7 +29,7 @@ from jaxprt.brdf import Lambert, MetallicRoughness
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.relit import reflection
 from jaxprt.relit.channels import Shading, of_part
-from jaxprt.relit.groups import Place
+from jaxprt.relit.groups import Layout
 from jaxprt.relit.recipes import Target
 from jaxprt.scene import Camera, Environment, Mesh, Part, TexturedMaterial, builtin
 from jaxprt.scene.mesh import make_mesh, split
@@ -127,11 +127,11 @@ def measure(
         own = jnp.asarray(scene.judged[:, None], jnp.float32)
         chosen["floor"] = np.asarray(image.render(scene.mesh, own, scene.camera, background=None)) > 0.99
     sizes = [len(each.mesh.position) for each in scene.shadings]
-    place = Place.apart(sizes)
+    layout = Layout.apart(sizes)
     for count in counts:
         start = time.perf_counter()
         target = Target(scene.mesh, size=16, run=prt.Run(progress=False))
-        system = reflection.make(scene.shadings, place, count, target)
+        system = reflection.make(scene.shadings, layout, count, target)
         seconds = time.perf_counter() - start
         blends = [each.blend for each in scene.shadings]
         frame = harness.measure(lambda: _radiance(system, scene, blends), repeats=2 if quick else 10)  # noqa: B023

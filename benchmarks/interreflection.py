@@ -181,7 +181,7 @@ def errors(scene: RelitScene, triples: Sequence[Triple], pictures: pathlib.Path 
 
 def camera_of(scene: RelitScene, triple: Triple) -> Camera:
     """From the eye of a triple to the middle of what stands on the ground."""
-    center = np.mean(np.asarray(scene.mesh.position)[: scene.place.counts[0]], 0)
+    center = np.mean(np.asarray(scene.mesh.position)[: scene.layout.counts[0]], 0)
     return Camera(triple.eye, center, [0.0, 1.0, 0.0], 0.6, EDGE, EDGE)
 
 

@@ -212,15 +212,15 @@ def with_transfer(
     With `terms`, light paths off parts of Blinn-Phong have as many terms, and lobes of `EXPONENTS` as they are.
     """
     assert scene.bounces is not None
-    shadings = [scene.shading[parts[0]] for parts in scene.place.parts]
+    shadings = [scene.shading[parts[0]] for parts in scene.layout.parts]
     lights = [
         sharp_path(terms) if terms is not None and shading.table == standard.BLINN_PHONG else paths.factor(shading)
         for shading in shadings
     ]
-    weights = [paths.typical(part, lights[n]) for part, n in zip(scene.shading, scene.place.group, strict=True)]
-    brdfs, mesh = [lights[number].brdf for number in scene.place.group], joined_mesh(scene.shading)
+    weights = [paths.typical(part, lights[n]) for part, n in zip(scene.shading, scene.layout.group, strict=True)]
+    brdfs, mesh = [lights[number].brdf for number in scene.layout.group], joined_mesh(scene.shading)
     tensor = bounces.precompute(mesh, brdfs, weights=weights, run=prt.Run(path, progress=False), **options)
-    vertices = [scene.place.vertices(number) for number in range(len(lights))]
+    vertices = [scene.layout.vertices(number) for number in range(len(lights))]
     groups = [
         dataclasses.replace(group, sent=light.sent) for group, light in zip(scene.bounces.group, lights, strict=True)
     ]

@@ -175,7 +175,7 @@ def radiance(
         reflected = jax.vmap(arriving)(lights)
     tilts, result = view.stage.table.frame is not None, []
     parts = zip(surfaces, groups.projected(surfaces, lights), reflected, blends, view.group, strict=True)
-    for number, (surface, *rows, blend, viewed) in enumerate(parts):
-        surface = groups.sampled(surface, max(view.stage.place.of_group(number, view.stage.samples)))
+    for group, (surface, *rows, blend, viewed) in enumerate(parts):
+        surface = groups.sampled(surface, max(view.stage.layout.of_group(group, view.stage.samples)))
         result.append(under_lights(surface, tuple(rows), lamp, blend, viewed, tilts=tilts))
     return jax.vmap(groups.ordered, (0, None))(tuple(result), jnp.asarray(order))

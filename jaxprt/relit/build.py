@@ -182,7 +182,7 @@ class _Traced:
     scene: Scene  # with the materials that its systems show
     near: Scene  # the scene with its origin at zero
     shadings: list[Shading]
-    place: groups.Place  # where the vertices of the parts stand in the groups
+    layout: groups.Layout  # where the vertices of the parts stand in the groups
     systems: list[System]
     lamps: lamps.SceneLamps | None
 
@@ -193,21 +193,21 @@ class _Traced:
         """Traces the rays of a scene."""
         scene = _as_shaded(scene, shadings)
         parts = groups.kinds(shadings, recipes)
-        place = groups.Place.of(scene.counts, parts, [recipes[members[0]].joins for members in parts])
+        layout = groups.Layout.of(scene.counts, parts, [recipes[members[0]].joins for members in parts])
         names = [_file_name(members, scene) for members in place.parts]
         targets = [Target(near.mesh, size=size, run=run.within(name)) for name in names]
-        systems = _systems(recipes, shadings, targets, place)
-        lit = lamps.make(near, shadings, place, systems, targets, scene.point_lights)
-        return cls(scene, near, shadings, place, systems, lit)
+        systems = _systems(recipes, shadings, targets, layout)
+        lit = lamps.make(near, shadings, layout, systems, targets, scene.point_lights)
+        return cls(scene, near, shadings, layout, systems, lit)
 
     def reflected(self, bounces: int | str, target: Target, *, rays: int) -> GroupBounces:
         """Light that the parts reflect onto each other."""
-        lamp, systems = self.lamps and self.lamps.transport(self.place), self.systems if rays else None
-        return reflection.make(self.shadings, self.place, bounces, target, lamp=lamp, systems=systems)
+        lamp, systems = self.lamps and self.lamps.transport(self.layout), self.systems if rays else None
+        return reflection.make(self.shadings, self.layout, bounces, target, lamp=lamp, systems=systems)
 
     def relit(self, reflected: GroupBounces | None = None, **fields: Any) -> RelitScene:
         """The relit scene."""
-        return RelitScene(self.scene, self.shadings, self.place, self.systems, reflected, lamps=self.lamps, **fields)
+        return RelitScene(self.scene, self.shadings, self.layout, self.systems, reflected, lamps=self.lamps, **fields)
 
 
 def _coarse(
@@ -245,11 +245,11 @@ def shaded(parts: Sequence[Part], recipes: Sequence[Recipe]) -> list[Shading]:
 
 
 def _systems(
-    recipes: Sequence[Recipe], shadings: Sequence[Shading], targets: Sequence[Target], place: groups.Place
+    recipes: Sequence[Recipe], shadings: Sequence[Shading], targets: Sequence[Target], layout: groups.Layout
 ) -> list[System]:
     """The system of each group."""
     systems, unfinished = [], []
-    for members, size, target in zip(place.parts, place.size, targets, strict=True):
+    for members, size, target in zip(layout.parts, layout.size, targets, strict=True):
         recipe, shading = recipes[members[0]], groups.joined([shadings[part] for part in members])
         try:
             systems.append(recipe.make(shading, target, vertices=size if recipe.joins else None))

@@ -114,7 +114,7 @@ class VertexMaterials(eqx.Module):
     flag: Float[Array | np.ndarray, " v"]
 
 
-class Place(eqx.Module):
+class Layout(eqx.Module):
     """Where the vertices of all parts stand, on the host.
 
     Attributes:
@@ -128,30 +128,30 @@ class Place(eqx.Module):
     size: tuple[int, ...] = eqx.field(static=True)
 
     @classmethod
-    def of(cls, counts: Sequence[int], parts: Sequence[Sequence[int]], joins: Sequence[bool]) -> "Place":
-        """The places of parts with given numbers of vertices. Groups whose recipe does not join parts have no padding.
+    def of(cls, counts: Sequence[int], parts: Sequence[Sequence[int]], joins: Sequence[bool]) -> "Layout":
+        """The layout of parts with given numbers of vertices. Groups whose recipe does not join parts have no padding.
 
         Args:
             counts: Number of vertices of each part.
             parts: Indices of the parts of each group.
             joins: Whether the recipe of each group joins parts.
         """
-        exact = [sum(counts[number] for number in members) for members in parts]
+        exact = [sum(counts[part] for part in members) for members in parts]
         pairs = zip(exact, joins, strict=True)
         size = [max(shared_size(count), _FEWEST) if padded else count for count, padded in pairs]
         return cls(tuple(counts), tuple(tuple(members) for members in parts), tuple(size))
 
     @classmethod
-    def apart(cls, counts: Sequence[int]) -> "Place":
-        """The places of parts each of which is a group of its own, without padding."""
-        return cls(tuple(counts), tuple((number,) for number in range(len(counts))), tuple(counts))
+    def apart(cls, counts: Sequence[int]) -> "Layout":
+        """The layout of parts each of which is a group of its own, without padding."""
+        return cls(tuple(counts), tuple((part,) for part in range(len(counts))), tuple(counts))
 
     @cached_property
     def group(self) -> Int[np.ndarray, " n"]:
         """Group of each part."""
         result = np.empty(len(self.counts), np.int32)
-        for number, members in enumerate(self.parts):
-            result[list(members)] = number
+        for group, members in enumerate(self.parts):
+            result[list(members)] = group
         return result
 
     @cached_property
@@ -164,7 +164,7 @@ class Place(eqx.Module):
         """Index of the first vertex of each part in its group."""
         result = np.empty(len(self.counts), np.int32)
         for members in self.parts:
-            result[list(members)] = np.cumsum([0, *(self.counts[number] for number in members)])[:-1]
+            result[list(members)] = np.cumsum([0, *(self.counts[part] for part in members)])[:-1]
         return result
 
     @cached_property
@@ -172,65 +172,65 @@ class Place(eqx.Module):
         """Index of a vertex of each part in the scene, minus its index in its group."""
         return self.first - self.start
 
-    def of_group(self, number: int, values: Sequence[T] | np.ndarray) -> list[T]:
+    def of_group(self, group: int, values: Sequence[T] | np.ndarray) -> list[T]:
         """The values of the parts of a group, from those of all parts."""
-        return [values[part] for part in self.parts[number]]
+        return [values[part] for part in self.parts[group]]
 
-    def vertices(self, number: int) -> Int[np.ndarray, " v"]:
+    def vertices(self, group: int) -> Int[np.ndarray, " v"]:
         """Index in the scene of each vertex of a group, without padding."""
-        pairs = zip(self.of_group(number, self.first), self.of_group(number, self.counts), strict=True)
+        pairs = zip(self.of_group(group, self.first), self.of_group(group, self.counts), strict=True)
         return np.concatenate([first + np.arange(count) for first, count in pairs])
 
     def order(self, points: Points | Sequence[Points] = VERTICES) -> Int[np.ndarray, " p"]:
         """Index of each vertex of the scene, or of each point, among those of all groups."""
         if not isinstance(points, Points):
             counts = [len(of_part) for of_part in points]
-            size = [sum(self.of_group(number, counts)) for number in range(len(self.parts))]
-            return Place(tuple(counts), self.parts, tuple(size)).order()
+            size = [sum(self.of_group(group, counts)) for group in range(len(self.parts))]
+            return Layout(tuple(counts), self.parts, tuple(size)).order()
         begin = np.cumsum([0, *self.size])[self.group] + self.start
         return np.concatenate([first + np.arange(n) for first, n in zip(begin, self.counts, strict=True)])
 
-    def points(self, number: int, points: Points | Sequence[Points]) -> tuple[Points, Points]:
+    def points(self, group: int, points: Points | Sequence[Points]) -> tuple[Points, Points]:
         """The vertices of a group, or the points on it, as points of the scene and of the group."""
         if isinstance(points, Points):
-            vertex = self.column(number, [self.vertices(number)])
+            vertex = self.column(group, [self.vertices(group)])
             return at_vertices(vertex.astype(np.int32)), VERTICES
-        members = self.of_group(number, points)
+        members = self.of_group(group, points)
         xp = np if known(members) else jnp
         in_scene, corner = (
-            [of_part.corner + row for of_part, row in zip(members, self.of_group(number, first), strict=True)]
+            [of_part.corner + row for of_part, row in zip(members, self.of_group(group, first), strict=True)]
             for first in (self.first, self.start)
         )
         weight = xp.concatenate([of_part.weight for of_part in members], 1)
         slopes: list[Any] = [of_part.slope for of_part in members]
         slope = None if any(rows is None for rows in slopes) else xp.concatenate(slopes, 2)
         corners = (xp.concatenate(rows, 1) for rows in (in_scene, corner))
-        scene, group = (Points(jnp.asarray(rows), jnp.asarray(weight), slope) for rows in corners)
-        return scene, group
+        whole, own = (Points(jnp.asarray(rows), jnp.asarray(weight), slope) for rows in corners)
+        return whole, own
 
-    def column(self, number: int, rows: Sequence[Any]) -> Any:
+    def column(self, group: int, rows: Sequence[Any]) -> Any:
         """One array of a group from those of its parts. Padding repeats the last row."""
         xp = np if known(rows) else jnp
         whole = xp.concatenate([xp.asarray(row) for row in rows])
-        room = [(0, self.size[number] - len(whole)), *[(0, 0)] * (whole.ndim - 1)]
+        room = [(0, self.size[group] - len(whole)), *[(0, 0)] * (whole.ndim - 1)]
         return xp.pad(whole, room, mode="edge")
 
-    def gathered(self, number: int, appearances: Sequence[Appearance]) -> Appearance:
+    def gathered(self, group: int, appearances: Sequence[Appearance]) -> Appearance:
         """The appearance of a group from those of all parts."""
-        members = self.of_group(number, appearances)
+        members = self.of_group(group, appearances)
         emitted = None
         if any(look.emitted is not None for look in members):
-            none = [np.zeros((count, 3), jnp.result_type(float)) for count in self.of_group(number, self.counts)]
+            none = [np.zeros((count, 3), jnp.result_type(float)) for count in self.of_group(group, self.counts)]
             pairs = zip(members, none, strict=True)
-            emitted = self.column(number, [zero if look.emitted is None else look.emitted for look, zero in pairs])
+            emitted = self.column(group, [zero if look.emitted is None else look.emitted for look, zero in pairs])
         if members[0].blend is None:
             return Appearance(None, emitted)
         blends = [look.blend for look in members if look.blend is not None]
         colors = max(blend.weight.shape[2] for blend in blends)
         wide = [_colored(blend.weight, colors) for blend in blends]
         parameter = zip(*(blend.parameter for blend in blends), strict=True)
-        columns = tuple(self.column(number, rows) for rows in parameter)
-        return Appearance(Blend(self.column(number, wide), columns), emitted)
+        columns = tuple(self.column(group, rows) for rows in parameter)
+        return Appearance(Blend(self.column(group, wide), columns), emitted)
 
 
 def _colored(weight: Any, colors: int) -> Any:
@@ -265,9 +265,9 @@ class Arriving(NamedTuple):
     reflected: tuple[PyTree, ...] | None
     lamp: Float[Array, "n 3"] | None
 
-    def at(self, number: int) -> tuple[PyTree, PyTree, PyTree]:
+    def at(self, group: int) -> tuple[PyTree, PyTree, PyTree]:
         """Direct light, reflected light and the lamps of a group."""
-        return self.direct[number], None if self.reflected is None else self.reflected[number], self.lamp
+        return self.direct[group], None if self.reflected is None else self.reflected[group], self.lamp
 
 
 class Stage(eqx.Module):
@@ -284,7 +284,7 @@ class Stage(eqx.Module):
         rough: The roughness of all parts alone, where JAX traces other parameters; None where the table is known.
         fixed: For each group, materials that users give at vertices; None without.
         bend: Curvature of the radiance of each vertex, from `curvature.of_part`.
-        place: Where the vertices of the parts stand.
+        layout: Where the vertices of the parts stand.
         samples: Number of sample points along the edge of each bright texel, for each part.
         sharp: Whether narrow lobes of each part are traced by rays.
         lamp: Index of the lamp that each part is; -1 for a part that does not emit.
@@ -300,7 +300,7 @@ class Stage(eqx.Module):
     rough: MaterialTable | None
     fixed: tuple[VertexMaterials | None, ...]
     bend: Float[Array, " v"]
-    place: Place
+    layout: Layout
     samples: tuple[int, ...] = eqx.field(static=True)
     sharp: tuple[bool, ...] = eqx.field(static=True)
     lamp: tuple[int, ...] = eqx.field(static=True)
@@ -321,38 +321,38 @@ class Stage(eqx.Module):
     @property
     def part(self) -> Int[np.ndarray, " v"]:
         """Part of each vertex."""
-        return np.repeat(np.arange(len(self.place.counts)), self.place.counts)
+        return np.repeat(np.arange(len(self.layout.counts)), self.layout.counts)
 
     @property
     def shift(self) -> Int[np.ndarray, " v"]:
         """Index of each vertex, minus its index in its group."""
-        return self.place.shift[self.part]
+        return self.layout.shift[self.part]
 
     @property
     def sharp_groups(self) -> list[int]:
         """Indices of the groups from which reflection rays start."""
-        return [number for number, surface in enumerate(self.surfaces) if surface.has_rays]
+        return [group for group, surface in enumerate(self.surfaces) if surface.has_rays]
 
-    def sharp_at(self, number: int, points: Points) -> Float[Array, " p"] | None:
+    def sharp_at(self, group: int, points: Points) -> Float[Array, " p"] | None:
         """1 at points of the scene whose narrow lobes are traced, 0 at others; None for a group without rays."""
-        if number not in self.sharp_groups:
+        if group not in self.sharp_groups:
             return None
         flag = np.asarray(self.sharp, jnp.result_type(float))[self.part]
         if known(points):
             return put(flag[np.asarray(points.corner)[0]])
         return jnp.asarray(flag)[points.corner[0]]
 
-    def blend(self, number: int, points: Points, on_group: Points) -> tuple[Blend | None, Points]:
+    def blend(self, group: int, points: Points, on_group: Points) -> tuple[Blend | None, Points]:
         """Weights of the channels of a group's BRDF at some points, and the points with the normals of normal maps.
 
         Args:
-            number: Index of the group.
+            group: Index of the group.
             points: The points in the scene.
             on_group: The same points on the group, which the second result is made of.
         """
         look = look_at(self.table, self.rough, points)
-        with compile_time(look, on_group, self.fixed[number], self.surfaces[number].scale):
-            return material(self.surfaces[number], on_group, look, self.fixed[number])[0], on_group.tilted(look.normal)
+        with compile_time(look, on_group, self.fixed[group], self.surfaces[group].scale):
+            return material(self.surfaces[group], on_group, look, self.fixed[group])[0], on_group.tilted(look.normal)
 
 
 def check_points(points: Any, counts: Sequence[int]) -> None:
@@ -395,13 +395,13 @@ def projected(surfaces: Sequence[Surface], lights: Float[Array, "l 6 n n c"]) ->
 def kinds(shadings: Sequence[Shading], recipes: Sequence[Any]) -> list[list[int]]:
     """Indices of the parts of each group: parts with one BRDF and one recipe, if the recipe joins parts."""
     result: list[list[int]] = []
-    for number, (shading, recipe) in enumerate(zip(shadings, recipes, strict=True)):
+    for part, (shading, recipe) in enumerate(zip(shadings, recipes, strict=True)):
         for members in result:
             if recipe.joins and recipes[members[0]] == recipe and alike(shadings[members[0]], shading):
-                members.append(number)
+                members.append(part)
                 break
         else:
-            result.append([number])
+            result.append([part])
     return result
 
 
@@ -442,9 +442,9 @@ def joined(shadings: Sequence[Shading]) -> Shading:
 
 
 def surface(
-    number: int,
+    group: int,
     shadings: Sequence[Shading],
-    place: Place,
+    layout: Layout,
     system: System,
     reflecting: ReflectingPart | None,
     lit: LitByLamps | None,
@@ -452,14 +452,14 @@ def surface(
     """A group of a scene.
 
     Args:
-        number: Index of the group.
+        group: Index of the group.
         shadings: The `Shading` of each part of the scene.
-        place: Where the vertices of the parts stand.
+        layout: Where the vertices of the parts stand.
         system: The system of direct light.
         reflecting: How the group reflects light from other surfaces; None without bounces.
         lit: How it reflects light from lamps; None without lamps.
     """
-    members = place.of_group(number, shadings)
+    members = layout.of_group(group, shadings)
     shading, dtype = members[0], jnp.result_type(float)
     scale = None
     if shading.scale is not None and shading.blend is not None:
@@ -471,7 +471,7 @@ def surface(
             (np.asarray(part.mesh.position, dtype), frames(part.mesh.normal, part.mesh.tangent)) for part in members
         ]
         position, frame = (
-            jax.device_put(place.column(number, rows).astype(dtype)) for rows in zip(*pairs, strict=True)
+            jax.device_put(layout.column(group, rows).astype(dtype)) for rows in zip(*pairs, strict=True)
         )
     brdf, varies = grid.as_argument(shading.brdf), bool(shading.knot)
     return Surface(system, position, frame, brdf, reflecting, lit, scale, shading.term, varies)

@@ -49,20 +49,20 @@ class LampLight:
     @cached_property
     def _sources(self) -> list[Mesh | PointLight]:
         """The lamps in their order: emitting parts first, then point lights."""
-        part = np.argsort(self.stage.lamp, kind="stable")[self.stage.lamp.count(-1) :]
-        meshes = split(self.stage.whole) if len(part) else []
-        return [*(meshes[number] for number in part), *self.stage.point_lights]
+        emitting = np.argsort(self.stage.lamp, kind="stable")[self.stage.lamp.count(-1) :]
+        meshes = split(self.stage.whole) if len(emitting) else []
+        return [*(meshes[part] for part in emitting), *self.stage.point_lights]
 
     @cached_property
     def _places(self) -> dict[int, LampPlaces]:
         """Places on the lamps, by the number of pieces of each surface, as far as they were needed."""
         return {}
 
-    def _places_for(self, number: int) -> LampPlaces:
+    def _places_for(self, group: int) -> LampPlaces:
         """Places on the lamps for the points of a group."""
-        place, bend = self.stage.place, self.stage.bend
+        layout, bend = self.stage.layout, self.stage.bend
         # Roughness that JAX traces may become small.
-        smooth = not known(bend) or np.asarray(bend)[place.first[list(place.parts[number])]].max() > _SMOOTH
+        smooth = not known(bend) or np.asarray(bend)[layout.first[list(layout.parts[group])]].max() > _SMOOTH
         few = sum(lamp >= 0 for lamp in self.stage.lamp) <= _MANY
         pieces = _FINE if smooth and few else _COARSE
         if pieces not in self._places:
@@ -70,15 +70,15 @@ class LampLight:
                 self._places[pieces] = places(self._sources, np.asarray(self.stage.power), pieces=pieces)
         return self._places[pieces]
 
-    def row(self, number: int, index: Int[Array | np.ndarray, " p"], on_group: Points) -> LampTransport:
+    def row(self, group: int, index: Int[Array | np.ndarray, " p"], on_group: Points) -> LampTransport:
         """The transport of the lamps to some points.
 
         Args:
-            number: Index of the group of the points.
+            group: Index of the group of the points.
             index: Indices of the points among those of the picture; -1 in padding.
             on_group: The same points on the group.
         """
-        surface, index = self.stage.surfaces[number], np.asarray(index)
+        surface, index = self.stage.surfaces[group], np.asarray(index)
         point = np.maximum(index, 0)
         with compile_time(surface.position, surface.frame, on_group):
             position, frame = placed(surface.position, surface.frame, on_group)
@@ -87,7 +87,7 @@ class LampLight:
         barycentric, slope = (np.asarray(column)[point] for column in (self.pixels.barycentric, self.pixels.slope))
         points = picture_rays.PicturePoints(triangle, barycentric, slope, pixel // self.width, pixel % self.width)
         fields = np.asarray(position), np.asarray(frame)[:, 2]
-        lamp_places = self._places_for(number)
+        lamp_places = self._places_for(group)
         moment = picture_rays.moments(self._caster.occluder, self._caster.mesh, points, *fields, lamp_places)
         return at_points(moment, position, frame, self._sources, lamp_places.pieces)
 

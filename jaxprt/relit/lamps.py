@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxprt.compile import known
 from jaxprt.relit.channels import Appearance, Shading
-from jaxprt.relit.groups import Place, joined_mesh
+from jaxprt.relit.groups import Layout, joined_mesh
 from jaxprt.relit.recipes import Target, lobe_table
 from jaxprt.scene import PointLight, Scene
 from jaxprt.scene import origin as origins
@@ -42,13 +42,13 @@ class SceneLamps(eqx.Module):
     area: tuple[Float[Array | np.ndarray, " _"], ...]
     point_lights: tuple[PointLight, ...]
 
-    def transport(self, place: Place) -> LampTransport:
+    def transport(self, layout: Layout) -> LampTransport:
         """The transport to the vertices of all parts, in their order.
 
         Args:
-            place: Where the vertices of the parts stand in the groups.
+            layout: Where the vertices of the parts stand in the groups.
         """
-        groups = [(place.vertices(number), lit.transport) for number, lit in enumerate(self.group)]
+        groups = [(layout.vertices(group), lit.transport) for group, lit in enumerate(self.group)]
         order = np.argsort(np.concatenate([vertex for vertex, _ in groups]))
 
         def column(name: str, axis: int) -> np.ndarray:
@@ -67,14 +67,14 @@ class SceneLamps(eqx.Module):
             changed: Point lights with other intensities, by name.
         """
         rows: list[Any] = [
-            _mean(area, appearances[number].emitted) for number, area in zip(self.emitting, self.area, strict=True)
+            _mean(area, appearances[part].emitted) for part, area in zip(self.emitting, self.area, strict=True)
         ]
         rows += [changed.get(light.name, light).intensity for light in self.point_lights]
         return jax.device_put(np.stack(rows)) if known(rows) else jnp.stack(rows)
 
     def names(self, parts: Sequence[str]) -> tuple[str, ...]:
         """Names of the lamps in their order, from the names of all parts."""
-        return (*(parts[number] for number in self.emitting), *(light.name for light in self.point_lights))
+        return (*(parts[part] for part in self.emitting), *(light.name for light in self.point_lights))
 
     def sources(
         self, appearances: Sequence[Appearance], origin: origins.Origin
@@ -106,7 +106,7 @@ def _mean(area: Any, emitted: Any) -> Any:
 def make(
     scene: Scene,
     shadings: Sequence[Shading],
-    place: Place,
+    layout: Layout,
     systems: Sequence[System],
     targets: Sequence[Target],
     point_lights: tuple[PointLight, ...],
@@ -116,24 +116,24 @@ def make(
     Args:
         scene: The scene, with its origin at zero.
         shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
-        place: Where the vertices of the parts stand in their groups.
+        layout: Where the vertices of the parts stand in their groups.
         systems: The systems of the groups. If one has a table of lobes, it is used.
         targets: For each group, what casts shadows, and where and how to compute.
         point_lights: The point lights of the scene, in the coordinates of its file.
     """
-    emitting = [number for number, shading in enumerate(shadings) if shading.emitted is not None]
+    emitting = [part for part, shading in enumerate(shadings) if shading.emitted is not None]
     if not emitting and not scene.point_lights:
         return None
-    sources = [*(shadings[number].mesh for number in emitting), *scene.point_lights]
+    sources = [*(shadings[part].mesh for part in emitting), *scene.point_lights]
     groups = []
-    for members, size, system, target in zip(place.parts, place.size, systems, targets, strict=True):
+    for members, size, system, target in zip(layout.parts, layout.size, systems, targets, strict=True):
         shading, mesh = shadings[members[0]], joined_mesh([shadings[part] for part in members])
         transport = axes.pad(lamps.precompute(mesh, sources, apart=True, **target.traced("lamps")), size)
         if shading.matte:
             groups.append(LitByLamps(transport, albedo=shading.albedo))
         else:
             groups.append(LitByLamps(transport, lobe_table(shading, _LOBES, system)))
-    area = tuple(np.asarray(areas(shadings[number].mesh), jnp.result_type(float)) for number in emitting)
+    area = tuple(np.asarray(areas(shadings[part].mesh), jnp.result_type(float)) for part in emitting)
     return SceneLamps(tuple(groups), tuple(emitting), area, point_lights)
 
 

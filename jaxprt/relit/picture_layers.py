@@ -66,8 +66,8 @@ def of_points(
     height, width, dtype = camera.height, camera.width, np.asarray(pixels.barycentric).dtype
     averaged = {name: jnp.zeros((height, width, len(LAYERS[name])), dtype) for name in names if name not in _NEAREST}
     gray = _gray(pixels)
-    for number, index in rows if averaged else ():
-        values = _materials(stage, pixels, number, index)
+    for group, index in rows if averaged else ():
+        values = _materials(stage, pixels, group, index)
         drawn = {
             name: jnp.broadcast_to(values[name], (len(index), image.shape[-1])) for name, image in averaged.items()
         }
@@ -85,11 +85,11 @@ def _gray(pixels: Pixels) -> Pixels:
     return dataclasses.replace(pixels, coverage=np.asarray(pixels.coverage).mean(-1))
 
 
-def _materials(stage: Stage, pixels: Pixels, number: int, index: Int[np.ndarray, " p"]) -> dict[str, Any]:
+def _materials(stage: Stage, pixels: Pixels, group: int, index: Int[np.ndarray, " p"]) -> dict[str, Any]:
     """Normals, base colors and roughness at points of a row."""
     points, on_group = canvas.points_of(pixels, stage.face, stage.shift, index)
     look = look_at(stage.table, stage.rough, points)
-    surface = stage.surfaces[number]
+    surface = stage.surfaces[group]
     normal, albedo = on_group.tilted(look.normal).frame(surface.frame)[:, 2], look.values.base_color
     if surface.scale is None and surface.matte:  # of a BRDF that cannot change
         albedo = surface.system.view(jnp.zeros(3, normal.dtype), None)

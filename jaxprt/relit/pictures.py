@@ -46,14 +46,14 @@ class Row(eqx.Module):
     """Points of a picture on one group that are shaded together.
 
     Attributes:
-        number: Index of the group.
+        group: Index of the group.
         samples: Number of sample points along the edge of each bright texel.
         index: Indices of the points among all points of the picture; -1 is padding. Inside of `jax.jit` these are all
             rows of the group.
         viewed: What does not depend on the light; None if it is computed anew for each light.
     """
 
-    number: int = eqx.field(static=True)
+    group: int = eqx.field(static=True)
     samples: int = eqx.field(static=True)
     index: Int[Array | np.ndarray, "*m p"]
     viewed: Viewed | None
@@ -208,7 +208,7 @@ class PictureView(eqx.Module):
         recompute = not known([light.arriving for light in lights], self.stage, self.camera)
         traced, rows = 0, []
         for row in self.rows:
-            sharp = row.number in self.stage.sharp_groups
+            sharp = row.group in self.stage.sharp_groups
             of_row = [light.of_row(traced if sharp else None, _glow(self, row, light.share)) for light in lights]
             traced += sharp
             colors = _colors_of_row(self, row, of_row, lamps, apart=apart, recompute=recompute)
@@ -240,7 +240,7 @@ class PictureView(eqx.Module):
         result = {"alpha": self._alpha()[..., 0]} if "alpha" in names else {}
         others = [name for name in names if name != "alpha"]
         if others:
-            rows = [(row.number, row.index) for row in self.rows]
+            rows = [(row.group, row.index) for row in self.rows]
             result |= geometry_layers(self.stage, self.pixels, rows, self.camera, others, fold=self.fold)
         return result
 
@@ -378,7 +378,7 @@ def _colors_of_row(
     recompute: bool,
 ) -> list[tuple[Float[Array, "*m p c"], ...]]:
     """Colors of the points of a row under each light; also of direct light if `apart`."""
-    surface = sampled(picture.stage.surfaces[row.number], row.samples)
+    surface = sampled(picture.stage.surfaces[row.group], row.samples)
     if row.index.ndim == 2:  # of a view that was made inside of `jax.jit`
         return [_colors_of_some(picture, row, light, apart=apart) for light in lights]
     if isinstance(row.viewed, Viewed):
@@ -399,8 +399,8 @@ def _shaded(
 ) -> list[tuple[Float[Array, "p c"], ...]]:
     """Colors of some points of a row under each light, with a view that is not stored."""
     points, on_group = _points(picture, index)
-    transport = None if lamps is None else lamps.row(row.number, index, on_group)
-    seen = _seen(picture.stage, surface, row.number, points, on_group, picture.camera, lamps=transport)
+    transport = None if lamps is None else lamps.row(row.group, index, on_group)
+    seen = _seen(picture.stage, surface, row.group, points, on_group, picture.camera, lamps=transport)
     return [_lit(surface, row, index, seen, light, apart=apart) for light in lights]
 
 
@@ -413,7 +413,7 @@ def _lit(
         seen = dataclasses.replace(seen, emitted=seen.emitted * light.glow[:, None])
     if light.traced is not None:
         texels = TexelLight(*shadows.of_points(light.traced, index), light.traced.rest.radiance.shape[-2], row.samples)
-    direct, reflected, lamp = light.arriving.at(row.number)
+    direct, reflected, lamp = light.arriving.at(row.group)
     color = radiance(surface, (direct, reflected, lamp), seen, texels=texels, reflections=light.reflections)
     if not apart:
         return (color,)
@@ -427,7 +427,7 @@ def _colors_of_some(
     picture: PictureView, row: Row, light: RowLight, *, apart: bool
 ) -> tuple[Float[Array, "m p c"], ...]:
     """`_shaded` under one light inside of `jax.jit`, where most rows may be padding alone."""
-    surface = sampled(picture.stage.surfaces[row.number], row.samples)
+    surface = sampled(picture.stage.surfaces[row.group], row.samples)
 
     def shade(index: Array, light: RowLight) -> tuple[Array, ...]:
         return _shaded(picture, surface, row, index, None, apart, [light])[0]
@@ -484,19 +484,19 @@ def make(
     lit = lamplight.of(stage, pixels, camera.width) if rays else None
     complete, origins, sharp = [], [], stage.sharp_groups
     for row in rows:
-        surface = sampled(stage.surfaces[row.number], row.samples)
+        surface = sampled(stage.surfaces[row.group], row.samples)
         stores = keep and not isinstance(row.index, Tracer)
-        if stores or row.number in sharp:
+        if stores or row.group in sharp:
             index = row.index if row.index.ndim == 1 else row.index[0]
             points, on_group = canvas.points_of(pixels, stage.face, stage.shift, index)
-            transport = None if lit is None else lit.row(row.number, index, on_group)
+            transport = None if lit is None else lit.row(row.group, index, on_group)
             if stores:
-                seen = _seen(stage, surface, row.number, points, on_group, camera, lamps=transport)
+                seen = _seen(stage, surface, row.group, points, on_group, camera, lamps=transport)
                 row = dataclasses.replace(row, viewed=seen)
-            if row.number in sharp:
-                blend, tilted = stage.blend(row.number, points, on_group)
-                narrow = stage.sharp_at(row.number, points)
-                origins.append(tracing.RayOrigins(row.number, points, tilted, blend, narrow, transport))
+            if row.group in sharp:
+                blend, tilted = stage.blend(row.group, points, on_group)
+                narrow = stage.sharp_at(row.group, points)
+                origins.append(tracing.RayOrigins(row.group, points, tilted, blend, narrow, transport))
         complete.append(row)
     reflected = tracing.trace(stage, origins, jnp.asarray(camera.eye), keep=keep) if origins else None
     ray = raster.ray_direction(camera)
@@ -527,7 +527,7 @@ def drawn(camera: Camera, samples: int) -> tuple[int, Camera, int]:
 def _seen(
     stage: Stage,
     surface: Surface,
-    number: int,
+    group: int,
     points: Points,
     on_group: Points,
     camera: Camera,
@@ -535,7 +535,7 @@ def _seen(
 ) -> Viewed:
     """What does not depend on the light, for a row of points with their materials."""
     look, eye = look_at(stage.table, stage.rough, points), jnp.asarray(camera.eye)
-    options = {"fixed": stage.fixed[number], "sharp": stage.sharp_at(number, points), "lamps": lamps}
+    options = {"fixed": stage.fixed[group], "sharp": stage.sharp_at(group, points), "lamps": lamps}
     # The view does not depend on the samples of bright texels.
     return view(sampled(surface, 1), on_group, look, eye, **options)
 
@@ -568,15 +568,15 @@ def _traced_rows(stage: Stage, pixels: Pixels) -> Iterator[Row]:
     """The points in rows by group, inside of `jax.jit`: as many rows for each group as if it had all points."""
     first = jnp.asarray(stage.face)[jnp.maximum(pixels.triangle, 0), 0]
     owner = jnp.where(pixels.triangle >= 0, jnp.asarray(stage.part)[first], -1)
-    for number, parts in enumerate(stage.place.parts):
-        samples = max(stage.place.of_group(number, stage.samples))
-        yield Row(number, samples, canvas.rows_of(jnp.isin(owner, jnp.asarray(parts))), None)
+    for group, parts in enumerate(stage.layout.parts):
+        samples = max(stage.layout.of_group(group, stage.samples))
+        yield Row(group, samples, canvas.rows_of(jnp.isin(owner, jnp.asarray(parts))), None)
 
 
 def _rows(stage: Stage, owner: np.ndarray) -> Iterator[Row]:
     """The points in rows by group and number of samples."""
-    for number, parts in enumerate(stage.place.parts):
-        for samples in sorted(set(stage.place.of_group(number, stage.samples))):
+    for group, parts in enumerate(stage.layout.parts):
+        for samples in sorted(set(stage.layout.of_group(group, stage.samples))):
             same = [part for part in parts if stage.samples[part] == samples]
             for index in canvas.rows_of(np.isin(owner, same), owner=owner):
-                yield Row(number, samples, index, None)
+                yield Row(group, samples, index, None)

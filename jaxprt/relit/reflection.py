@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxprt.relit import curvature, paths
 from jaxprt.relit.channels import Shading
-from jaxprt.relit.groups import Place, Surface, joined_mesh
+from jaxprt.relit.groups import Layout, Surface, joined_mesh
 from jaxprt.relit.recipes import Target, harmonic_table, lobe_table, samples_of
 from jaxprt.scene import Environment, Mesh, PointLight
 from jaxprt.scene.mesh import Opacity, frames
@@ -51,7 +51,7 @@ def check(count: int | str | None) -> None:
 
 def make(
     shadings: Sequence[Shading],
-    place: Place,
+    layout: Layout,
     count: int | str,
     target: Target,
     *,
@@ -65,7 +65,7 @@ def make(
 
     Args:
         shadings: One `Shading` for each part: its mesh, BRDF and channel weights.
-        place: Where the vertices of the parts stand in their groups.
+        layout: Where the vertices of the parts stand in their groups.
         count: Number of bounces, at least 1; or "all".
         target: Size of the light, and where and how to compute. All parts occlude each other, and all vertices are lit.
         lamp: Transport of the lamps to the vertices of all parts; None without lamps.
@@ -77,34 +77,34 @@ def make(
     """
     first = [shadings[members[0]] for members in place.parts]
     of_group = [paths.factor(shading) for shading in first]
-    typical = [paths.typical(shading, of_group[group]) for shading, group in zip(shadings, place.group, strict=True)]
-    region, members = _regions(place, typical)
+    typical = [paths.typical(shading, of_group[group]) for shading, group in zip(shadings, layout.group, strict=True)]
+    region, members = _regions(layout, typical)
     mesh = dataclasses.replace(
-        joined_mesh(shadings), region=np.repeat(region, place.counts), opacity=target.occluder.opacity
+        joined_mesh(shadings), region=np.repeat(region, layout.counts), opacity=target.occluder.opacity
     )
-    sent = [of_group[place.group[parts[0]]] for parts in members]
-    weights = [_mean([typical[part] for part in parts], [place.counts[part] for part in parts]) for parts in members]
+    sent = [of_group[layout.group[parts[0]]] for parts in members]
+    weights = [_mean([typical[part] for part in parts], [layout.counts[part] for part in parts]) for parts in members]
     options = {"edge": min(_EDGE, target.size), "run": target.run.within("bounces.prt")}
     # Omit nothing: the number of bounces is decided, and later materials may reflect more.
     tensor = bounces.precompute(
         mesh, [path.brdf for path in sent], weights=weights, lamps=lamp, bounces=count, **options
     )
     groups = []
-    for number, (shading, path) in enumerate(zip(first, of_group, strict=True)):
-        parts = place.of_group(number, shadings)
+    for group, (shading, path) in enumerate(zip(first, of_group, strict=True)):
+        parts = layout.of_group(group, shadings)
         frame = [frames(part.mesh.normal, part.mesh.tangent) for part in parts]
-        position = place.column(number, [part.mesh.position for part in parts])
+        position = layout.column(group, [part.mesh.position for part in parts])
         table = harmonic_table(shading, degree=DEGREE)
-        position, axes = jax.device_put((position, place.column(number, frame)))
-        lobe = None if systems is None else _lobes(parts, systems[number])
+        position, axes = jax.device_put((position, layout.column(group, frame)))
+        lobe = None if systems is None else _lobes(parts, systems[group])
         groups.append(ReflectingPart(position, axes, table, sent=path.sent, lobe=lobe))
-    return GroupBounces.make(tensor, groups, [place.vertices(number) for number in range(len(groups))])
+    return GroupBounces.make(tensor, groups, [layout.vertices(group) for group in range(len(groups))])
 
 
-def _regions(place: Place, typical: Sequence[Array | None]) -> tuple[Int[np.ndarray, " n"], list[list[int]]]:
+def _regions(layout: Layout, typical: Sequence[Array | None]) -> tuple[Int[np.ndarray, " n"], list[list[int]]]:
     """Each part's region of the transfer tensor, and each region's parts, which send light with one mean material."""
-    region = np.full(len(place.counts), -1, np.int32)
-    for parts in map(list, place.parts):
+    region = np.full(len(layout.counts), -1, np.int32)
+    for parts in map(list, layout.parts):
         label = np.arange(len(parts))
         most = -(-_REGIONS * len(parts) // len(region))
         # A group whose material cannot change is one region.
@@ -115,7 +115,7 @@ def _regions(place: Place, typical: Sequence[Array | None]) -> tuple[Int[np.ndar
             rows = _stacked([typical[part] for part in parts]).reshape(len(parts), -1)
             label = scipy.cluster.hierarchy.fcluster(scipy.cluster.hierarchy.ward(rows), most, "maxclust") - 1
         region[parts] = np.max(region) + 1 + label
-    return region, [np.flatnonzero(region == number).tolist() for number in range(np.max(region) + 1)]
+    return region, [np.flatnonzero(region == one).tolist() for one in range(np.max(region) + 1)]
 
 
 def _mean(weights: Sequence[Array | None], counts: Sequence[int]) -> Float[Array, "p c"] | None:
@@ -187,7 +187,7 @@ def fractions(
             ratio = min((last / before) ** 0.5, _SLOWEST) if before > 0 else 0.0
             of_part = np.concatenate([of_part[:-1], of_part[-1:] / (1 - ratio)])
             whole = max(float(np.linalg.norm(of_part.sum(0))), 1e-30)
-            left = [float(np.linalg.norm(of_part[number:].sum(0))) / whole for number in range(1, _EACH + 1)]
+            left = [float(np.linalg.norm(of_part[count:].sum(0))) / whole for count in range(1, _EACH + 1)]
             result[:, part] = np.maximum(result[:, part], np.asarray(left))
     return result
 

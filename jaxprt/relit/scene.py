@@ -21,7 +21,7 @@ from jaxprt.relit import batches, channels, groups, measuring, pictures, reflect
 from jaxprt.relit import lamps as scene_lamps
 from jaxprt.relit.casting import caster
 from jaxprt.relit.channels import Appearance, Changeable, Shading, appearance
-from jaxprt.relit.groups import Arriving, Place, SceneLight, Stage, Surface, VertexMaterials
+from jaxprt.relit.groups import Arriving, Layout, SceneLight, Stage, Surface, VertexMaterials
 from jaxprt.relit.lamps import SceneLamps
 from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.refinement import MeshDivision
@@ -66,7 +66,7 @@ class RelitScene(System):
     Attributes:
         scene: The scene.
         shading: Mesh, BRDF and channel weights of each part.
-        place: Where the vertices of the parts stand in the groups.
+        layout: Where the vertices of the parts stand in the groups.
         surfaces: One `Surface` for each group of parts of one kind.
         appearance: The materials at the vertices of each group.
         bounces: The system of light that the parts reflect onto each other; None without bounces.
@@ -87,7 +87,7 @@ class RelitScene(System):
 
     scene: Scene
     shading: tuple[Shading, ...]
-    place: Place
+    layout: Layout
     surfaces: tuple[Surface, ...]
     appearance: tuple[Appearance, ...]
     bounces: GroupBounces | None
@@ -107,7 +107,7 @@ class RelitScene(System):
         self,
         scene: Scene,
         shading: Sequence[Shading],
-        place: Place,
+        layout: Layout,
         systems: Sequence[System],
         bounces: GroupBounces | None = None,
         *,
@@ -121,7 +121,7 @@ class RelitScene(System):
         Args:
             scene: The scene.
             shading: Mesh, BRDF and weights of each part, from `jaxprt.relit.channels.of_part`.
-            place: Where the vertices of the parts stand in the groups.
+            layout: Where the vertices of the parts stand in the groups.
             systems: The system of each group for direct light.
             bounces: The system of light that the parts reflect onto each other; None without bounces.
             lamps: Emitting parts and point lights, precomputed; None without.
@@ -141,25 +141,25 @@ class RelitScene(System):
             for part in scene.parts
         ]
         self.scene = dataclasses.replace(scene, parts=parts)
-        self.shading, self.place, self.bounces, self.lamps = tuple(shading), place, bounces, lamps
+        self.shading, self.layout, self.bounces, self.lamps = tuple(shading), layout, bounces, lamps
         self.mesh, self.rays = scene.mesh, rays
         self.drawn = groups.padded(self.mesh)
         self.table = jax.device_put(material_table.of_parts(self.scene.parts))
         first = [channels.precomputed(part) for part in shading]
-        self.appearance = tuple(jax.device_put(place.gathered(number, first)) for number in range(len(systems)))
+        self.appearance = tuple(jax.device_put(layout.gathered(group, first)) for group in range(len(systems)))
         self.surfaces = tuple(
             groups.surface(
-                number,
+                group,
                 shading,
-                place,
+                layout,
                 system,
-                None if bounces is None else bounces.group[number],
-                None if lamps is None else lamps.group[number],
+                None if bounces is None else bounces.group[group],
+                None if lamps is None else lamps.group[group],
             )
-            for number, system in enumerate(systems)
+            for group, system in enumerate(systems)
         )
-        pairs = zip(shading, place.group, strict=True)
-        traits = (reflection.traits(part, self.surfaces[number]) for part, number in pairs)
+        pairs = zip(shading, layout.group, strict=True)
+        traits = (reflection.traits(part, self.surfaces[group]) for part, group in pairs)
         curvature, samples, sharp = zip(*traits, strict=True)
         self.curvature, self.samples, self.sharp = np.asarray(curvature, self.mesh.position.dtype), samples, sharp
         self.camera = scenes.default_camera(scene, self.mesh)
@@ -170,20 +170,20 @@ class RelitScene(System):
         vertices = [
             np.arange(count - len(copies)) for count, copies in zip(self._whole_counts(), self.copied, strict=True)
         ]
-        return np.concatenate([first + index for first, index in zip(self.place.first, vertices, strict=True)])
+        return np.concatenate([first + index for first, index in zip(self.layout.first, vertices, strict=True)])
 
     def _whole_counts(self) -> list[int]:
         """Number of vertices of each part with copies for its back, before its mesh was divided."""
-        return list(self.place.counts if self.division is None else self.division.counts)
+        return list(self.layout.counts if self.division is None else self.division.counts)
 
-    def _divided(self, number: int, material: Blend | Appearance) -> Blend | Appearance:
+    def _divided(self, part: int, material: Blend | Appearance) -> Blend | Appearance:
         """Materials at the vertices of a part, copied and interpolated to the added ones if they are of the file's."""
-        counts, copies = self._whole_counts(), self.copied[number]
-        count = counts[number] - len(copies)
+        counts, copies = self._whole_counts(), self.copied[part]
+        count = counts[part] - len(copies)
         rows = {len(leaf) for leaf in jax.tree.leaves(material) if np.ndim(leaf)}
-        if count == self.place.counts[number] or rows != {count}:
+        if count == self.layout.counts[part] or rows != {count}:
             return material
-        parents = [] if self.division is None else subdivision.part_parents(counts, self.division.parent)[number]
+        parents = [] if self.division is None else subdivision.part_parents(counts, self.division.parent)[part]
         source = np.concatenate([np.arange(count), copies])
         return jax.tree.map(lambda leaf: jnp.asarray(subdivision.spread(leaf[source], parents)), material)
 
@@ -255,15 +255,15 @@ class RelitScene(System):
         appearances = self.appearances(of_parts)
         stage, looks = self._stage(of_parts, appearances), self._gathered(appearances)
         views, starts = [], []
-        for number, (surface, look) in enumerate(zip(stage.surfaces, looks, strict=True)):
-            in_scene, on_group = self._points(number, stage, points)
+        for group, (surface, look) in enumerate(zip(stage.surfaces, looks, strict=True)):
+            in_scene, on_group = self._points(group, stage, points)
             blend, emitted = jax.tree.map(on_group.carry, (look.blend, look.emitted))
-            sharp = stage.sharp_at(number, in_scene)
+            sharp = stage.sharp_at(group, in_scene)
             if sharp is not None:
                 if on_group.all_vertices:
                     with compile_time(self.mesh, eye):
-                        sharp = sharp * tracing.facing(self.mesh, eye)[in_scene.corner[0]] * self._real(number)
-                starts.append(tracing.RayOrigins(number, in_scene, on_group, blend, sharp))
+                        sharp = sharp * tracing.facing(self.mesh, eye)[in_scene.corner[0]] * self._real(group)
+                starts.append(tracing.RayOrigins(group, in_scene, on_group, blend, sharp))
             views.append(Viewed(on_group, view_of(surface, eye, blend, on_group, sharp), emitted))
         reflected = tracing.trace(stage, starts, eye, keep=True) if starts else None
         return SceneView(tuple(views), stage, reflected)
@@ -280,11 +280,11 @@ class RelitScene(System):
         assert isinstance(light, Arriving)
         traced = iter(()) if view.reflected is None else iter(view.reflected.radiance(view.stage, light))
         colors = []
-        for number, (surface, viewed) in enumerate(zip(self.surfaces, view.group, strict=True)):
-            surface = groups.sampled(surface, max(self.place.of_group(number, view.stage.samples)))
-            reflections = next(traced) if number in view.stage.sharp_groups else None
-            colors.append(radiance(surface, light.at(number), viewed, reflections=reflections))
-        return groups.ordered(tuple(colors), self.place.order(points))
+        for group, (surface, viewed) in enumerate(zip(self.surfaces, view.group, strict=True)):
+            surface = groups.sampled(surface, max(self.layout.of_group(group, view.stage.samples)))
+            reflections = next(traced) if group in view.stage.sharp_groups else None
+            colors.append(radiance(surface, light.at(group), viewed, reflections=reflections))
+        return groups.ordered(tuple(colors), self.layout.order(points))
 
     @promoted
     def under_lights(
@@ -298,19 +298,19 @@ class RelitScene(System):
         appearances = self.appearances(of_parts)
         blends = [look.blend for look in self._gathered(appearances)]
         lamp = None if self.lamps is None else self.lamps.radiance(self._all(appearances), changed)
-        return batches.radiance(self.surfaces, self.bounces, lights, blends, lamp, view, self.place.order(points))
+        return batches.radiance(self.surfaces, self.bounces, lights, blends, lamp, view, self.layout.order(points))
 
-    def _points(self, number: int, stage: Stage, points: Points | Sequence[Points]) -> tuple[Points, Points]:
+    def _points(self, group: int, stage: Stage, points: Points | Sequence[Points]) -> tuple[Points, Points]:
         """Points, with the normals of normal maps, as points of the scene and of a group."""
-        in_scene, on_group = self.place.points(number, points)
+        in_scene, on_group = self.layout.points(group, points)
         if stage.table.frame is None:
             return in_scene, on_group
         return in_scene, on_group.tilted(groups.look_at(stage.table, stage.rough, in_scene).normal)
 
-    def _real(self, number: int) -> Float[np.ndarray, " v"]:
+    def _real(self, group: int) -> Float[np.ndarray, " v"]:
         """1 at vertices of a group, 0 in padding."""
-        count = sum(self.place.of_group(number, self.place.counts))
-        return (np.arange(self.place.size[number]) < count).astype(self.mesh.position.dtype)
+        count = sum(self.layout.of_group(group, self.layout.counts))
+        return (np.arange(self.layout.size[group]) < count).astype(self.mesh.position.dtype)
 
     def _gathered(self, appearances: Mapping[str, Appearance]) -> list[Appearance]:
         """The appearance of each group: the precomputed one, or with other materials of some parts."""
@@ -318,8 +318,8 @@ class RelitScene(System):
             return list(self.appearance)
         looks, changed = self._all(appearances), [name in appearances for name in self.scene.names]
         return [
-            self.place.gathered(number, looks) if any(self.place.of_group(number, changed)) else look
-            for number, look in enumerate(self.appearance)
+            self.layout.gathered(group, looks) if any(self.layout.of_group(group, changed)) else look
+            for group, look in enumerate(self.appearance)
         ]
 
     def _stage(self, materials: Mapping[str, Any] | None, appearances: Mapping[str, Appearance]) -> Stage:
@@ -330,12 +330,12 @@ class RelitScene(System):
         fixed = [name in of_parts and name not in new for name in names]
         unchanged = Appearance(None)
         changed = [appearances.get(name, unchanged) for name in names]
-        at_vertices = [self._vertex_materials(number, fixed, changed) for number in range(len(self.surfaces))]
+        at_vertices = [self._vertex_materials(group, fixed, changed) for group in range(len(self.surfaces))]
         bend, samples, sharp = self._traits(changed)
-        surfaces = [self._surface(number, sharp) for number in range(len(self.surfaces))]
+        surfaces = [self._surface(group, sharp) for group in range(len(self.surfaces))]
         emitting = {} if self.lamps is None else {part: lamp for lamp, part in enumerate(self.lamps.emitting)}
         lamp = tuple(emitting.get(part, -1) for part in range(len(names)))
-        bends = groups.spread(bend, self.place.counts, len(self.drawn.position), self.mesh.position.dtype)
+        bends = groups.spread(bend, self.layout.counts, len(self.drawn.position), self.mesh.position.dtype)
         return Stage(
             self.mesh,
             self.drawn,
@@ -344,7 +344,7 @@ class RelitScene(System):
             rough,
             tuple(at_vertices),
             bends,
-            self.place,
+            self.layout,
             samples,
             sharp,
             lamp,
@@ -372,33 +372,33 @@ class RelitScene(System):
         rows = list(zip(self.curvature, self.samples, self.sharp, strict=True))
         for part, (look, shading) in enumerate(zip(appearances, self.shading, strict=True)):
             if look.blend is not None and shading.table is not None and known(look):
-                number = self.place.group[part]
+                group = self.layout.group[part]
                 new = dataclasses.replace(shading, blend=look.blend)
-                rows[part] = reflection.traits(new, self.surfaces[number])
+                rows[part] = reflection.traits(new, self.surfaces[group])
         bend, samples, sharp = zip(*rows, strict=True)
         return list(bend), samples, sharp
 
-    def _surface(self, number: int, sharp: Sequence[bool]) -> Surface:
+    def _surface(self, group: int, sharp: Sequence[bool]) -> Surface:
         """A group, with rays for its reflections if any of its parts is sharp."""
-        surface = self.surfaces[number]
-        if surface.reflecting is None or not self.rays or not any(self.place.of_group(number, sharp)):
+        surface = self.surfaces[group]
+        if surface.reflecting is None or not self.rays or not any(self.layout.of_group(group, sharp)):
             return surface.without_rays
         return dataclasses.replace(surface, reflecting=dataclasses.replace(surface.reflecting, count=self.rays))
 
     def _vertex_materials(
-        self, number: int, fixed: Sequence[bool], appearances: Sequence[Appearance]
+        self, group: int, fixed: Sequence[bool], appearances: Sequence[Appearance]
     ) -> VertexMaterials | None:
         """Materials that users give at the vertices of some parts of a group; None without."""
-        flags, counts = (self.place.of_group(number, values) for values in (fixed, self.place.counts))
-        if not any(flags) or self.surfaces[number].scale is None:
+        flags, counts = (self.layout.of_group(group, values) for values in (fixed, self.layout.counts))
+        if not any(flags) or self.surfaces[group].scale is None:
             return None
         rows = zip(appearances, fixed, self.shading, strict=True)
-        whole = self.place.gathered(
-            number, [look if flag else channels.precomputed(shading) for look, flag, shading in rows]
+        whole = self.layout.gathered(
+            group, [look if flag else channels.precomputed(shading) for look, flag, shading in rows]
         )
         dtype = self.mesh.position.dtype
-        flag = self.place.column(number, [np.full(*row, dtype) for row in zip(counts, flags, strict=True)])
-        emitted = np.zeros((self.place.size[number], 3), dtype) if whole.emitted is None else whole.emitted
+        flag = self.layout.column(group, [np.full(*row, dtype) for row in zip(counts, flags, strict=True)])
+        emitted = np.zeros((self.layout.size[group], 3), dtype) if whole.emitted is None else whole.emitted
         assert whole.blend is not None
         return put(VertexMaterials(whole.blend, emitted, flag))
 
@@ -601,7 +601,7 @@ class RelitScene(System):
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
         samples, camera, fold = pictures.drawn(camera, samples)
         backs = sides.hidden_backs(self.scene)
-        hidden = groups.faces_of(self.mesh, np.repeat(backs, self.place.counts)) if backs.any() else None
+        hidden = groups.faces_of(self.mesh, np.repeat(backs, self.layout.counts)) if backs.any() else None
         occluder = None if self.mesh.opacity is None else caster(self.mesh).occluder
         options = {"samples": samples, "hidden": hidden, "occluder": occluder}
         cover = pixels.coverage(self.drawn, camera.local(self.mesh.origin), **options)
@@ -640,7 +640,7 @@ class RelitScene(System):
 
     def _glowing(self, camera: Camera) -> Bool[np.ndarray, "h w"]:
         """Whether the middle of each pixel shows a triangle with a vertex that emits."""
-        parts = zip(self.shading, self.place.counts, strict=True)
+        parts = zip(self.shading, self.layout.counts, strict=True)
         emitted = [
             np.zeros(count) if shading.emitted is None else np.asarray(shading.emitted).max(1)
             for shading, count in parts
@@ -716,8 +716,8 @@ class RelitScene(System):
             {name: material for name, material in materials.items() if channels.is_model(material)}
         )
         for name, material in materials.items():
-            number = names.index(name)
-            part, shading = self.scene.parts[number], self.shading[number]
+            index = names.index(name)
+            part, shading = self.scene.parts[index], self.shading[index]
             if shading.blend is None:
                 raise TypeError(
                     f"the material of part {name!r} is a BRDF, which cannot be replaced: precompute the scene with "
@@ -726,12 +726,12 @@ class RelitScene(System):
             kinds, source = (*typing.get_args(Changeable), Appearance, Blend), "jaxprt.scene or RelitScene.appearances"
             require.kind(f"the material of part {name!r}", material, *kinds, source=source)
             if channels.is_model(material):
-                first = int(self.place.first[number])
+                first = int(self.layout.first[index])
                 vertex = np.arange(first, first + len(part.mesh.position), dtype=np.int32)
                 look = groups.look_at(table, rough, material_table.at_vertices(vertex))
                 material = appearance(part, shading, material, look=look)
             else:
-                material = self._divided(number, material)
+                material = self._divided(index, material)
             result[name] = Appearance(material, shading.emitted) if isinstance(material, Blend) else material
             channels.check_blend(name, shading, result[name].blend)
             if not isinstance(result[name].emitted, Tracer | None) and shading.emitted is None:
@@ -744,7 +744,7 @@ class RelitScene(System):
     @property
     def vertices(self) -> int:
         """Number of vertices."""
-        return sum(self.place.counts)
+        return sum(self.layout.counts)
 
     @property
     def shared_light(self) -> tuple | None:
@@ -761,8 +761,8 @@ class RelitScene(System):
         """The system of direct light of the vertices of one part, given its index, without padding, in NumPy."""
         if part not in range(len(self.shading)):
             raise ValueError(f"part must be the index of one of {len(self.shading)} parts, got {part!r}")
-        first = int(self.place.start[part])
-        return axes.take(self.surfaces[self.place.group[part]].system, slice(first, first + self.place.counts[part]))
+        first = int(self.layout.start[part])
+        return axes.take(self.surfaces[self.layout.group[part]].system, slice(first, first + self.layout.counts[part]))
 
     def _all(self, appearances: Mapping[str, Appearance]) -> list[Appearance]:
         """The appearance of each part: the given one, or that of the material it was precomputed with."""

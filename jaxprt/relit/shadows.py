@@ -44,12 +44,12 @@ class TexelShares(eqx.Module):
     Attributes:
         texel: Indices of the texels.
         share: Share of each texel that each point of the picture sees, in 255ths.
-        place: Where in each texel the light of its file comes from; see `light_samples.places_in_texels`.
+        spot: Where in each texel the light of its file comes from; see `light_samples.spots_in_texels`.
     """
 
     texel: Int[Array, " t"]
     share: UInt8[Array | np.ndarray, "t p"]
-    place: Float[Array, "t 4"]
+    spot: Float[Array, "t 4"]
 
 
 class TracedLight(eqx.Module):
@@ -73,7 +73,7 @@ def of_points(light: TracedLight, index: Any) -> tuple[Array, Array, Array, Arra
         row = put(np.asarray(shares.share)[:, np.maximum(index, 0)])
     else:
         row = jnp.asarray(shares.share)[:, jnp.maximum(index, 0)]
-    return shares.texel, light.excess, row, shares.place
+    return shares.texel, light.excess, row, shares.spot
 
 
 def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, keep: bool) -> TracedLight | None:
@@ -106,8 +106,8 @@ def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, k
     share = np.zeros((len(number), len(pixels.triangle)), np.uint8)
     rays = picture_rays.TexelRays(direction, count)
     share[bright] = _shares(mesh, pixels, width, number[bright], rays) if keep else _cast(mesh, pixels, width, rays)
-    place = light_samples.places_in_texels(number, fine, size=size)
-    return TracedLight(rest, excess, TexelShares(texel, share, put(place.astype(environment.radiance.dtype))))
+    spot = light_samples.spots_in_texels(number, fine, size=size)
+    return TracedLight(rest, excess, TexelShares(texel, share, put(spot.astype(environment.radiance.dtype))))
 
 
 def untraced(environment: Environment) -> Environment:
@@ -150,8 +150,8 @@ def _shares(
     rows = _rows_of(pixels.triangle)
     share = np.empty((len(texel), len(pixels.triangle)), np.uint8)
     new = []
-    for number, (place, direction, count) in enumerate(zip(texel, rays.direction, rays.per_texel, strict=True)):
-        before = rows.get(int(place))
+    for number, (index, direction, count) in enumerate(zip(texel, rays.direction, rays.per_texel, strict=True)):
+        before = rows.get(int(index))
         if before is None or before[0] < _FEWER * count or not np.array_equal(before[1], direction):
             new.append(number)
         else:
@@ -161,8 +161,8 @@ def _shares(
     with _LOCK:
         for number in new:
             rows[int(texel[number])] = int(rays.per_texel[number]), rays.direction[number], share[number]
-        for place in list(rows)[: max(len(rows) - _MOST, 0)]:
-            del rows[place]
+        for index in list(rows)[: max(len(rows) - _MOST, 0)]:
+            del rows[index]
     return share
 
 

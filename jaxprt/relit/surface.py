@@ -64,7 +64,7 @@ class TexelLight(NamedTuple):
         texel: Indices of the texels.
         excess: Their radiance.
         share: Share of each texel that each point sees, in 255ths.
-        place: Where in each texel its light comes from.
+        spot: Where in each texel its light comes from.
         size: Edge of the cubemap faces in texels.
         samples: Number of sample points along the edge of each texel.
     """
@@ -72,7 +72,7 @@ class TexelLight(NamedTuple):
     texel: Int[Array, " t"]
     excess: Float[Array, "t c"]
     share: UInt8[Array, "t p"]
-    place: Float[Array, "t 4"]
+    spot: Float[Array, "t 4"]
     size: int
     samples: int
 
@@ -143,14 +143,14 @@ def _from_texels(
     texel: Int[Array, " t"],
     excess: Float[Array, "t c"],
     share: UInt8[Array, "t p"],
-    place: Float[Array, "t 4"],
+    spot: Float[Array, "t 4"],
     *,
     size: int,
     samples: int,
 ) -> Float[Array, "p c"]:
     """Radiance that points reflect from single texels of the light."""
     light = texel, excess / picture_rays.FULL, share
-    options = {"size": size, "samples": samples, "place": place}
+    options = {"size": size, "samples": samples, "spot": spot}
     return bright_texels.texel_radiance(
         surface.brdf, sight.frame, sight.wo, light, VERTICES, sight.blend, above=sight.above, **options
     )

@@ -41,7 +41,7 @@ class RayOrigins(eqx.Module):
     """Vertices or points of a group from which reflection rays start.
 
     Attributes:
-        number: Index of the group.
+        group: Index of the group.
         points: The points in the scene.
         on_group: The points on the group.
         blend: Material weights of the vertices or points.
@@ -49,7 +49,7 @@ class RayOrigins(eqx.Module):
         lamps: The transport of the lamps to the points; None to interpolate it between vertices.
     """
 
-    number: int = eqx.field(static=True)
+    group: int = eqx.field(static=True)
     points: Points
     on_group: Points
     blend: Blend | None
@@ -80,7 +80,7 @@ class HitRow(eqx.Module):
     """Hits on one group that are shaded together.
 
     Attributes:
-        number: Index of the group.
+        group: Index of the group.
         points: The hits as points of the scene.
         on_group: The hits as points on the group.
         eye: Origin of the ray of each hit.
@@ -88,7 +88,7 @@ class HitRow(eqx.Module):
         viewed: What does not depend on the light; None if it is computed anew for each light.
     """
 
-    number: int = eqx.field(static=True)
+    group: int = eqx.field(static=True)
     points: Points
     on_group: Points
     eye: Float[Array, "h 3"]
@@ -117,15 +117,15 @@ class Reflections(eqx.Module):
         colors = []
         for row in self.hits:
             viewed = _viewed(stage, row) if row.viewed is None else row.viewed
-            colors.append(radiance(stage.surfaces[row.number].without_rays, arriving.at(row.number), viewed))
+            colors.append(radiance(stage.surfaces[row.group].without_rays, arriving.at(row.group), viewed))
         return _read(self.paths, colors, arriving.lamp)
 
 
 def _viewed(stage: Stage, row: HitRow) -> Viewed:
     """What does not depend on the light, at the hits of a row."""
     look = look_at(stage.table, stage.rough, row.points)
-    options = {"fixed": stage.fixed[row.number], "variance": row.variance, "glows": False}
-    return view(stage.surfaces[row.number].without_rays, row.on_group, look, row.eye, **options)
+    options = {"fixed": stage.fixed[row.group], "variance": row.variance, "glows": False}
+    return view(stage.surfaces[row.group].without_rays, row.on_group, look, row.eye, **options)
 
 
 def trace(stage: Stage, origins: Sequence[RayOrigins], eye: Float[Array, "3"], *, keep: bool) -> Reflections:
@@ -141,7 +141,7 @@ def trace(stage: Stage, origins: Sequence[RayOrigins], eye: Float[Array, "3"], *
         ValueError: The eye, the roughness, the points or the scene is traced by JAX.
     """
     for origin in origins:
-        _check(stage.whole, origin, stage.surfaces[origin.number].reflecting, eye)
+        _check(stage.whole, origin, stage.surfaces[origin.group].reflecting, eye)
     cast, hits, rays = caster(stage.whole), [], []
     for origin in origins:
         with jax.ensure_compile_time_eval():
@@ -160,7 +160,7 @@ def trace(stage: Stage, origins: Sequence[RayOrigins], eye: Float[Array, "3"], *
 
 def _reflecting(stage: Stage, origin: RayOrigins) -> ReflectingPart:
     """How the group of some origins reflects."""
-    reflecting = stage.surfaces[origin.number].reflecting
+    reflecting = stage.surfaces[origin.group].reflecting
     assert reflecting is not None
     return reflecting
 
@@ -169,7 +169,7 @@ def _lamps(
     stage: Stage, origin: RayOrigins, part: Int[np.ndarray, "j v"], weight: Array, concentration: Array
 ) -> Float[Array, "n v c"] | None:
     """Factor of the radiance of each lamp at each vertex or point, given the part that each ray hits (-1 for none)."""
-    lit = stage.surfaces[origin.number].lit
+    lit = stage.surfaces[origin.group].lit
     if lit is None:
         return None
     lamp = np.where(part >= 0, np.asarray(stage.lamp)[part], -1)
@@ -216,10 +216,10 @@ def _rows(stage: Stage, cast: Caster, hits: Sequence[tuple], *, keep: bool) -> t
     start = np.concatenate([np.zeros((0, 3), np.float32), *(np.tile(hit[2], (len(hit[0]), 1)) for hit in hits)])
     variance = np.concatenate([np.zeros(0, np.float32), *(hit[3].ravel() for hit in hits)])
     part = np.where(triangle >= 0, stage.part[cast.face[triangle, 0]], -1)
-    group = np.where(part >= 0, stage.place.group[part], -1)
+    owner = np.where(part >= 0, stage.layout.group[part], -1)
     slot, rows, total = np.full(len(triangle), -1, np.int32), [], 0
-    for number in range(len(stage.surfaces)):
-        index = np.flatnonzero(group == number)
+    for group in range(len(stage.surfaces)):
+        index = np.flatnonzero(owner == group)
         if not len(index):
             continue
         slot[index] = total + np.arange(len(index))
@@ -233,7 +233,7 @@ def _rows(stage: Stage, cast: Caster, hits: Sequence[tuple], *, keep: bool) -> t
             still = np.zeros((2, 3, canvas.ROW), weight.dtype)
             points, on_group = (put(Points(place, weight[hit].T.copy(), still)) for place in places)
             eye, spread = put((start[hit], variance[hit]))
-            row = HitRow(number, points, on_group, eye, spread, None)
+            row = HitRow(group, points, on_group, eye, spread, None)
             rows.append(dataclasses.replace(row, viewed=_viewed(stage, row)) if keep else row)
     slot = np.where(slot < 0, total, slot)
     shape = [hit[0].shape for hit in hits]

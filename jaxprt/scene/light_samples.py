@@ -119,7 +119,7 @@ def _on_curve(fraction: Float[np.ndarray, " d"]) -> Float[np.ndarray, "2 d"]:
     return place
 
 
-def places_in_texels(
+def spots_in_texels(
     texel: Int[np.ndarray, " t"], radiance: Float[np.ndarray, "6 m m c"], *, size: int
 ) -> Float[np.ndarray, "t 4"]:
     """Where in some texels of a light its flux comes from, by the same light at a finer resolution.

@@ -360,7 +360,7 @@ def texel_radiance(
     size: int,
     samples: int,
     above: Float[Array, "p 3"] | None = None,
-    place: Float[Array, "t 4"] | None = None,
+    spot: Float[Array, "t 4"] | None = None,
 ) -> Float[Array, "p e"]:
     """Radiance that vertices or points send: the sum over texels of light x BRDF x cosine x visibility.
 
@@ -375,7 +375,7 @@ def texel_radiance(
         size: Edge of the cubemap faces in texels.
         samples: Number of sample points along the edge of each texel.
         above: Normals below whose horizon no light arrives, in addition to those of the frames; None without.
-        place: Where in each texel its light comes from, from `jaxprt.scene.light_samples.places_in_texels`; None for
+        spot: Where in each texel its light comes from, from `jaxprt.scene.light_samples.spots_in_texels`; None for
             everywhere.
     """
     texel, excess, visible = light
@@ -413,9 +413,9 @@ def texel_radiance(
         return value(wi, wo, *parameter) * cosine
 
     if not len(texel):  # Rows are read by number: one that brings nothing.
-        texel, place = jnp.zeros(1, jnp.int32), None
+        texel, spot = jnp.zeros(1, jnp.int32), None
         excess, visible = (jnp.zeros((1, rows.shape[1]), rows.dtype) for rows in (excess, visible))
-    direction, area = (row.astype(excess.dtype) for row in _points(texel, size, samples, place))
+    direction, area = (row.astype(excess.dtype) for row in _points(texel, size, samples, spot))
     count = direction.shape[1]
     carried = count > 1 and not points.all_vertices
     if carried:

@@ -83,9 +83,9 @@ class _Views(NamedTuple):
     def around(cls, scene: RelitScene) -> "_Views":
         """Views in equal turns around the target of the scene's camera."""
         cameras, pixels, parts = [], [], []
-        hidden = faces_of(scene.mesh, np.repeat(sides.hidden_backs(scene.scene), scene.place.counts))
+        hidden = faces_of(scene.mesh, np.repeat(sides.hidden_backs(scene.scene), scene.layout.counts))
         occluder = None if scene.mesh.opacity is None else caster(scene.mesh).occluder
-        owner = np.repeat(np.arange(len(scene.place.counts)), scene.place.counts)[np.asarray(scene.mesh.face)[:, 0]]
+        owner = np.repeat(np.arange(len(scene.layout.counts)), scene.layout.counts)[np.asarray(scene.mesh.face)[:, 0]]
         target = jnp.asarray(scene.camera.target)
         for number in range(_VIEWS):
             eye = target + stages.about(2 * np.pi * number / _VIEWS) @ (jnp.asarray(scene.camera.eye) - target)

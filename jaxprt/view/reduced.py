@@ -15,7 +15,7 @@ from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import put
 from jaxprt.relit import channels
 from jaxprt.relit.channels import Shading
-from jaxprt.relit.groups import Place
+from jaxprt.relit.groups import Layout
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Part, Scene, TexturedMaterial
 from jaxprt.systems import axes, standard
@@ -163,7 +163,7 @@ class PageScene:
                 exported.ReflectingSystem(system, put(rows.astype(jnp.result_type(float)))) if len(rows) else system
                 for system, rows in pairs
             ]
-        return RelitScene(self.scene, self.shading, Place.apart(self.scene.counts), systems)
+        return RelitScene(self.scene, self.shading, Layout.apart(self.scene.counts), systems)
 
     @property
     def bits(self) -> list[UInt8[np.ndarray, "v n"]] | None:

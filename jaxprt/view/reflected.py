@@ -33,7 +33,7 @@ def transfer(relit: RelitScene) -> list[Float[np.ndarray, "k 3 _"]] | None:
     if relit.lamps is not None and lamp is not None:
         last = [row + _direct(group, lamp) for row, group in zip(last, relit.lamps.group, strict=True)]
     groups = [np.stack(group) for group in zip(*rows, last, strict=True)]
-    spans = zip(relit.place.group, relit.place.start, relit.place.counts, strict=True)
+    spans = zip(relit.layout.group, relit.layout.start, relit.layout.counts, strict=True)
     return [groups[number][..., first : first + count] for number, first, count in spans]
 
 
@@ -42,7 +42,7 @@ def _reflected(
 ) -> list[Float[np.ndarray, "3 _"]]:
     """Irradiance / pi of reflected light at the vertices of each group."""
     if relit.bounces is None:
-        return [np.zeros((3, count)) for count in relit.place.size]
+        return [np.zeros((3, count)) for count in relit.layout.size]
     blends = [look.blend for look in relit.appearance]
     arriving = relit.bounces.shade(relit.bounces.light(light), blends, lamp)
     factor, zonal = upright_cosine(_ARRIVING), np.arange(_ARRIVING + 1)

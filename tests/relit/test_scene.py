@@ -373,7 +373,7 @@ def test_exposure_is_not_of_lamps():
 
 def test_the_camera_is_the_scenes_first_or_one_that_sees_all():
     ready = relit("harmonic")
-    made_of = ready.shading, ready.place, [surface.system for surface in ready.surfaces]
+    made_of = ready.shading, ready.layout, [surface.system for surface in ready.surfaces]
     with_camera = RelitScene(scene(cameras=[CAMERA, orbit(mesh("ball"))]), *made_of)
     np.testing.assert_array_equal(with_camera.picture(light()), relit("harmonic").picture(light(), CAMERA))
     around = relit("harmonic").camera

@@ -12,7 +12,7 @@ import jaxprt as prt
 from jaxprt import view
 from jaxprt.brdf import BlinnPhong
 from jaxprt.compile import put
-from jaxprt.relit.groups import Place
+from jaxprt.relit.groups import Layout
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, Part, PointLight, Scene, TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
@@ -326,7 +326,7 @@ def test_matte_scene_needs_no_visibility(browser, lights, look, tmp_path):
 def test_size_that_is_asked_for_is_kept(systems, lights, made, tmp_path):
     scene = systems["lobes"].without_bounces()
     lobes = [put(scene.part_system(number)).system for number in range(2)]  # without single texels
-    bare = RelitScene(scene.scene, scene.shading, Place.apart(scene.place.counts), lobes)
+    bare = RelitScene(scene.scene, scene.shading, Layout.apart(scene.layout.counts), lobes)
     whole = view.export(bare, tmp_path / "a.html", environments=lights)
     smaller = view.export(bare, tmp_path / "b.html", environments=lights, most=whole.nbytes - 2000)
     assert (whole.edge, smaller.edge) == (2, 1)
@@ -337,10 +337,10 @@ def test_size_that_is_asked_for_is_kept(systems, lights, made, tmp_path):
 def test_what_a_page_does_not_have_is_refused(systems, tmp_path):
     scene = systems["harmonics"]
     ball, ground = (put(scene.part_system(number)) for number in range(2))
-    place = Place.apart(scene.place.counts)
+    layout = Layout.apart(scene.layout.counts)
 
     def refused(system, told):
-        changed = RelitScene(scene.scene, scene.shading, place, (system, ground))
+        changed = RelitScene(scene.scene, scene.shading, layout, (system, ground))
         with pytest.raises(ValueError, match=f"part 'ball' must {told}"):
             view.export(changed, tmp_path / "a.html")
 

@@ -13,7 +13,7 @@ import jaxprt as prt
 from jaxprt import image
 from jaxprt.compile import put
 from jaxprt.relit.build import shaded as shaded_parts
-from jaxprt.relit.groups import Place
+from jaxprt.relit.groups import Layout
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Camera, Environment, Part, Scene, Texture, TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
@@ -292,7 +292,7 @@ def test_why_a_scene_is_not_shaded_by_the_gpu_is_said(systems, lights, look):
     matrix = put(skewed.part_system(0)).transport.matrix
     ball = eqx.tree_at(lambda system: system.transport.matrix, put(skewed.part_system(0)), 2 * matrix + matrix[::-1])
     others = RelitScene(
-        skewed.scene, skewed.shading, Place.apart(skewed.place.counts), (ball, put(skewed.part_system(1)))
+        skewed.scene, skewed.shading, Layout.apart(skewed.layout.counts), (ball, put(skewed.part_system(1)))
     )
     metal = mapped(metallic=1.0, roughness=0.4)
     lit = prt.precompute(scene_of(metal, MATTE), refine=False, system=CASES["metal"][2], size=SIZE, progress=False)
