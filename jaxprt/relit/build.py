@@ -194,7 +194,7 @@ class _Traced:
         scene = _as_shaded(scene, shadings)
         parts = groups.kinds(shadings, recipes)
         layout = groups.Layout.of(scene.counts, parts, [recipes[members[0]].joins for members in parts])
-        names = [_file_name(members, scene) for members in place.parts]
+        names = [_file_name(members, scene) for members in layout.parts]
         targets = [Target(near.mesh, size=size, run=run.within(name)) for name in names]
         systems = _systems(recipes, shadings, targets, layout)
         lit = lamps.make(near, shadings, layout, systems, targets, scene.point_lights)

@@ -75,7 +75,7 @@ def make(
     Returns:
         The system of reflected light alone.
     """
-    first = [shadings[members[0]] for members in place.parts]
+    first = [shadings[members[0]] for members in layout.parts]
     of_group = [paths.factor(shading) for shading in first]
     typical = [paths.typical(shading, of_group[group]) for shading, group in zip(shadings, layout.group, strict=True)]
     region, members = _regions(layout, typical)
