@@ -36,6 +36,7 @@ from jaxprt import RelitScene, bounces, files, image
 from jaxprt.relit import Dynamic
 from jaxprt.relit.groups import joined_mesh
 from jaxprt.scene import Camera, Environment
+from jaxprt.sphere import cubemap
 
 EDGE, SAMPLES = 256, 144
 LONGEST = (64, 96)
