@@ -10,6 +10,14 @@ export const toDisplay = (x) => (x <= 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 
 export const hex = (color) => "#" + color.map((x) => Math.round(255 * toDisplay(clamp(x, 0, 1))).toString(16).padStart(2, "0")).join("");
 export const unhex = (text) => [1, 3, 5].map((i) => toLinear(parseInt(text.slice(i, i + 2), 16) / 255));
 
+const LONGEST = 2048; // pixels of the longer edge of what is drawn for the window
+
+// Pixels of a canvas that is shown in a box: at most two for each pixel of the style, in the shape of the box.
+export function drawnSize(box, ratio) {
+  const factor = Math.min(ratio, 2, LONGEST / Math.max(box.width, box.height, 1));
+  return { width: Math.max(1, Math.round(box.width * factor)), height: Math.max(1, Math.round(box.height * factor)) };
+}
+
 export function element(tag, parent, fields = {}) {
   const node = document.createElement(tag);
   Object.assign(node, fields);

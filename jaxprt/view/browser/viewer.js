@@ -1,7 +1,7 @@
 // The viewer: mesh and camera live here, colors come from Python. The same module runs in notebooks (anywidget calls
 // `render`) and on a page of its own (`mount`). No libraries.
 
-import { add, clamp, decompressed, inflate, unit } from "./common.js";
+import { add, clamp, decompressed, drawnSize, inflate, unit } from "./common.js";
 import { Camera, meet } from "./camera.js";
 import { Drawing } from "./drawing.js";
 import { Piece } from "./piece.js";
@@ -36,8 +36,7 @@ export function mount(root, ask) {
 
   const waiting = new Waiting(busy);
   const resize = () => {
-    const ratio = Math.min(window.devicePixelRatio || 1, 2), box = canvas.getBoundingClientRect();
-    const width = clamp(Math.round(box.width * ratio), 1, 2048), height = clamp(Math.round(box.height * ratio), 1, 2048);
+    const { width, height } = drawnSize(canvas.getBoundingClientRect(), window.devicePixelRatio || 1);
     if (canvas.width !== width || canvas.height !== height) {
       Object.assign(canvas, { width, height });
       moved();
