@@ -22,6 +22,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 Function = TypeVar("Function", bound=Callable)
+Kind = TypeVar("Kind")
 
 LARGEST = 1e32  # magnitude of numbers that enter: sums over all texels and small factors fit into float32
 _ORTHOGONAL = 1e-4  # deviation of M M^T from the identity, due to rounding
@@ -321,11 +322,12 @@ def _host_memory() -> int | None:
         return free
 
 
-def kind(name: str, value: Any, *wanted: type, source: str) -> None:
-    """Refuses objects that are not of the wanted classes, by TypeError."""
-    if not isinstance(value, wanted):
-        names = " or ".join(kind.__name__ for kind in wanted)
-        raise TypeError(f"{name} must be of class {names}, which {source} makes, got {_describe(value)}")
+def kind(name: str, value: object, *wanted: type[Kind], source: str) -> Kind:
+    """The value if it is of one of the wanted classes; others are refused by TypeError."""
+    if isinstance(value, wanted):
+        return value
+    names = " or ".join(kind.__name__ for kind in wanted)
+    raise TypeError(f"{name} must be of class {names}, which {source} makes, got {_describe(value)}")
 
 
 def array(name: str, value: Any, *axes: str, source: str = "") -> None:

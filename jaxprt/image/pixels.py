@@ -27,7 +27,7 @@ from jaxprt.image.raster import SAMPLES, Fragments, ray_direction
 from jaxprt.scene import environment as environments
 from jaxprt.scene.camera import Camera, in_common_coordinates
 from jaxprt.scene.environment import Environment
-from jaxprt.scene.mesh import Mesh
+from jaxprt.scene.mesh import Mesh, Opacity
 from jaxprt.visibility import Occluder
 
 SMOOTH = math.cos(math.radians(10))  # smallest cosine between mean normals of triangles that may share a point
@@ -460,7 +460,7 @@ def visible_points(
         shown = seen_from_front(mesh, camera, hidden)
         fragments = finished(raster.rasterize(shown, camera, samples=samples), between)
         return finished(shading_points(fragments, mesh, camera, uneven=uneven), between)
-    slots = _slots(mesh, camera, samples, hidden, occluder)
+    slots = _slots(mesh, camera, samples, hidden, occluder, occluder.opacity)
     result = []
     for triangle, depth, share in slots:
         triangle, depth = (values[..., 0] if samples == 1 else values for values in (triangle, depth))
@@ -478,7 +478,7 @@ def coverage(
         fragments = raster.rasterize(seen_from_front(mesh, camera, hidden), camera, samples=samples)
         seen = jnp.asarray(fragments.triangle >= 0, jnp.result_type(float))
         return seen if seen.ndim == 2 else jnp.mean(seen, -1)
-    slots = _slots(mesh, camera, samples, hidden, occluder)
+    slots = _slots(mesh, camera, samples, hidden, occluder, occluder.opacity)
     empty = sum(np.mean(np.where(triangle < 0, _gray(share), 0), -1) for triangle, _, share in slots)
     return jnp.asarray(1 - empty, jnp.result_type(float))
 
@@ -497,7 +497,7 @@ def nearest_fragments(
     """
     if occluder is None or occluder.opacity is None:
         return raster.rasterize(seen_from_front(mesh, camera, hidden), camera)
-    slots = _slots(mesh, camera, 1, hidden, occluder)
+    slots = _slots(mesh, camera, 1, hidden, occluder, occluder.opacity)
     random = np.random.default_rng(0).random(slots[0][0].shape)
     triangle, depth, total = np.full(random.shape, -1, np.int32), np.full(random.shape, np.inf, np.float32), 0.0
     for one, where, share in slots:
@@ -525,7 +525,7 @@ def _hidden_now(mesh: Mesh, camera: Camera, hidden: Any) -> Any:
 
 
 def _slots(
-    mesh: Mesh, camera: Camera, samples: int, hidden: Any, occluder: Occluder
+    mesh: Mesh, camera: Camera, samples: int, hidden: Any, occluder: Occluder, opacity: Opacity
 ) -> list[tuple[Int[np.ndarray, "h w s"], Float[np.ndarray, "h w s"], Float[np.ndarray, "h w s *c"]]]:
     """Triangles, depths and shares of the surfaces that samples see, from front to back; triangle -1 is background."""
     if not known(camera, mesh):
@@ -533,12 +533,11 @@ def _slots(
             "pictures of surfaces with holes or translucent ones need concrete values, but the camera or the scene is "
             "traced by JAX: make the picture outside of jax.jit, or close the jitted function over them"
         )
-    assert occluder.opacity is not None
     count = len(occluder.face)
     clear = np.zeros(len(mesh.face), bool)
-    layer = np.asarray(occluder.opacity.layer)[occluder.face[:, 0]]
+    layer = np.asarray(opacity.layer)[occluder.face[:, 0]]
     clear[:count] = layer > 0
-    passing, glass = np.asarray(occluder.opacity.passing), np.asarray(occluder.opacity.glass)
+    passing, glass = np.asarray(opacity.passing), np.asarray(opacity.glass)
     passing = passing[layer, : 1 if np.all(passing == 1) else 3]  # shares are by color if there is colored glass
     away = np.zeros(len(mesh.face), bool) if hidden is None else _hidden_now(mesh, camera, hidden)
     opaque = dataclasses.replace(mesh, face=np.where((clear | away)[:, None], 0, np.asarray(mesh.face)))

@@ -212,8 +212,8 @@ def at_vertices(vertex: Int[np.ndarray, " p"]) -> Points:
 def _evaluate(table: MaterialTable, points: Points) -> MaterialLook:
     values, layers = _values(table, points)
     normal = None
-    if table.frame is not None:
-        normal, variance = _normals(table, points)
+    if table.frame is not None and table.normal_scale is not None:
+        normal, variance = _normals(table, table.frame, table.normal_scale, points)
         values = values._replace(roughness=texture.widen_roughness(values.roughness, variance))
         layers = layers and layers._replace(
             clearcoat_roughness=texture.widen_roughness(layers.clearcoat_roughness, variance)
@@ -281,12 +281,15 @@ def _values(table: MaterialTable, points: Points) -> tuple[Values, Layers | None
     return values, layers
 
 
-def _normals(table: MaterialTable, points: Points) -> tuple[Float[Array, "p 3"], Float[Array, " p"]]:
+def _normals(
+    table: MaterialTable,
+    frame: Float[Array | np.ndarray, "v 7"],
+    scale: Float[Array | np.ndarray, " m"],
+    points: Points,
+) -> tuple[Float[Array, "p 3"], Float[Array, " p"]]:
     """Shading normals at points, and the variance of the normals that a pixel averages; see `normal_maps`."""
-    assert table.frame is not None
-    assert table.normal_scale is not None
-    part, base = table.part[points.corner[0]], points.carry(table.frame)
-    has, scale = table.image[part, _NORMAL] >= 0, table.normal_scale[part]
+    part, base = table.part[points.corner[0]], points.carry(frame)
+    has, scale = table.image[part, _NORMAL] >= 0, scale[part]
     frame = directions.frame(directions.normalize(base[:, :3]), base[:, 3:6])
     coordinate, slope = _coordinates(table, points)
     place = coordinate, slope
@@ -301,9 +304,7 @@ def _normals(table: MaterialTable, points: Points) -> tuple[Float[Array, "p 3"],
 
 def _coordinates(table: MaterialTable, points: Points) -> tuple[Float[Array, "p 4"], Float[Array, "2 p 4"]]:
     """Both sets of texture coordinates at points, and their change from pixel to pixel."""
-    place = points.carry(table.coordinate)
-    still = points.slope is None
-    return place, jnp.zeros((2, *place.shape), place.dtype) if still else points.slopes(table.coordinate)
+    return points.carry(table.coordinate), points.slopes(table.coordinate)
 
 
 def _in_image(

@@ -93,11 +93,11 @@ class Part(eqx.Module):
 
     def surface(self) -> MaterialValues:
         """Material parameters at the vertices."""
-        require.kind(f"the material of part {self.name!r}", self.material, TexturedMaterial, source="jaxprt.load_scene")
-        assert isinstance(self.material, TexturedMaterial)
+        name = f"the material of part {self.name!r}"
+        material = require.kind(name, self.material, TexturedMaterial, source="jaxprt.load_scene")
         place = self.mesh.texture
         place = jnp.zeros((len(self.mesh.position), 2), self.mesh.position.dtype) if place is None else place
-        return self.material.at(place, self.second, color=self.color, handedness=self.handedness)
+        return material.at(place, self.second, color=self.color, handedness=self.handedness)
 
 
 def _place(value: Any) -> Any:

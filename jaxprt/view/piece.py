@@ -172,24 +172,21 @@ def _sizes(page: PageScene) -> Iterator[tuple[bool, _Size]]:
     lobes = sum(count for count, held in zip(counts, page.parts, strict=True) if held.scales is not None)
     matrices = [(count, held.degree) for count, held in zip(counts, page.parts, strict=True) if held.degree is not None]
     for texels in [True, False] if page.holds_texels else [False]:
-        degree = max((most for _, most in matrices), default=None)
+        degree = max((most for _, most in matrices), default=0)
         level = 0 if scale is None else FIRST
         while True:
-            yield texels, _Size(level, 0 if scale is None else int(scale.edge[level]), degree)
+            yield texels, _Size(level, 0 if scale is None else int(scale.edge[level]), degree if matrices else None)
             means = 0
             # From single texels the page makes averaged visibility, which then takes no bytes.
             if scale is not None and not texels and level < len(scale.edge) - 1:
                 means = lobes * int(scale.total - scale.start[level])
-            bands = 0
-            if degree is not None and degree > 1:
-                bands = sum(count * (2 * min(most, degree) + 1) ** 2 for count, most in matrices)
+            bands = sum(count * (2 * min(most, degree) + 1) ** 2 for count, most in matrices if degree > 1)
             if not means and not bands:
                 break
             # The data that takes more bytes is reduced first.
             if means >= bands:
                 level += 1
             else:
-                assert degree is not None
                 degree -= 1
 
 

@@ -239,8 +239,7 @@ class Session:
 
     def picture(self) -> Float[np.ndarray, "h w 3"]:
         """The first picture of the viewer, from vertex radiance, encoded for display."""
-        scene = self.stages.scene
-        assert isinstance(scene, RelitScene)
+        scene = stages.relit(self.stages.scene)
         camera = dataclasses.replace(scene.camera, width=_PICTURE[0], height=_PICTURE[1])
         color = scene.radiance(self.stages.lights[0], eye=camera.eye)
         behind = sky(self.stages.lights[0], camera)

@@ -31,6 +31,13 @@ _PARTS = 8  # most parts whose materials are changed for their programs
 Made = TypeVar("Made")
 
 
+def relit(scene: RelitScene | Unshadowed) -> RelitScene:
+    """The scene, if its rays have been traced."""
+    if isinstance(scene, Unshadowed):
+        raise ValueError("colors must have rays, which are still being traced")
+    return scene
+
+
 class Stages:
     """Lights, materials, views and pictures of several systems of one scene. It is safe to share between threads.
 
@@ -62,10 +69,7 @@ class Stages:
 
     def system(self, look: Look) -> RelitScene:
         """The relit scene of the system that a look names."""
-        system = (self.systems if look.bounces else self._bare)[look.system]
-        if isinstance(system, Unshadowed):
-            raise ValueError("colors must have rays, which are still being traced")
-        return system
+        return relit((self.systems if look.bounces else self._bare)[look.system])
 
     def unturned(self, number: int, lamps: tuple[Lamp, ...]) -> Environment:
         """A light with the lamps added, before rotation."""

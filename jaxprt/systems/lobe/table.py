@@ -10,7 +10,7 @@ stands in `benchmarks/published/lobes.py`.
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -455,16 +455,15 @@ def _entries_between(row: Float[Array, "r *q"], knot: list, axis: list, *, lobes
 @partial(isolated, static=("lobes",))
 def _interpolate(read: tuple[Array, ...], upper: tuple[Array, ...], share: tuple[Array, ...], *, lobes: int) -> _Entry:
     """Entries at all knots and nodes, interpolated: `upper` between knots, and in the given shares between nodes."""
-    entry, knots, total = [_entry(row, lobes=lobes) for row in read], 1 << len(upper), None
+    entry, knots, parts = [_entry(row, lobes=lobes) for row in read], 1 << len(upper), []
     for node, part in enumerate(share):
         at_knots = entry[node * knots : (node + 1) * knots]
         for weight in reversed(upper):
             pairs = zip(at_knots[::2], at_knots[1::2], strict=True)
             at_knots = [_between_knots(low, high, weight) for low, high in pairs]
-        scaled = jax.tree.map(lambda value, part=part: value * part.reshape(-1, *[1] * (value.ndim - 1)), at_knots[0])
-        total = scaled if total is None else jax.tree.map(jnp.add, total, scaled)
-    assert total is not None
-    return total
+        shares = jax.tree.map(lambda value, part=part: value * part.reshape(-1, *[1] * (value.ndim - 1)), at_knots[0])
+        parts.append(shares)
+    return reduce(partial(jax.tree.map, jnp.add), parts)
 
 
 @isolated
