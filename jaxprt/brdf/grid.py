@@ -22,7 +22,7 @@ def as_argument(brdf: Callable) -> Callable:
     return jax.tree_util.Partial(brdf) if jax.tree_util.all_leaves([brdf]) else brdf
 
 
-def check(brdf: Any) -> None:
+def check(brdf: object) -> None:
     """Refuses anything but a function of two directions that returns real numbers.
 
     Raises:

@@ -23,18 +23,18 @@ _GRAZING = 1e-4  # smallest cosine in half vectors and denominators
 _SMOOTHEST = 1e-3  # smallest roughness, because a perfect mirror has no density
 
 
-def color(value: Any) -> Any:
+def color(value: object) -> Any:
     """A scalar or a color as an array of shape [1] or [3]. What is not of numbers is left for the class to refuse."""
     value = scalar(value)
     return jnp.atleast_1d(value) if isinstance(value, jax.Array) and not value.ndim else value
 
 
-def scalar(value: Any) -> Any:
+def scalar(value: object) -> Any:
     """A number as an array of shape []. What is not of numbers is left for the class to refuse."""
     return require.floating(value, dtype=jnp.result_type(float))
 
 
-def _lobes(value: Any) -> Any:
+def _lobes(value: object) -> Any:
     """One number or color per lobe as an array of shape [l, 1] or [l, 3]."""
     value = scalar(value)
     return value[..., None] if isinstance(value, jax.Array) and value.ndim == 1 else value

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 
 from jaxprt import brdf
 from jaxprt.brdf import AshikhminShirley, Lambert
+from jaxprt.files.inputs import JsonObject
 from jaxprt.relit import refinement, registry
 from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial, builtin, load_environment, load_scene
 from jaxprt.scene import mesh as meshes
@@ -103,9 +104,9 @@ def of_part(text: str) -> tuple[str, str]:
     return part, material
 
 
-def describe(material: Any) -> dict[str, Any]:
+def describe(material: object) -> JsonObject:
     """A material as JSON: its model, parameters and textures."""
-    result: dict[str, Any] = {"model": type(material).__name__}
+    result: JsonObject = {"model": type(material).__name__}
     fields = dataclasses.fields(material) if dataclasses.is_dataclass(material) else ()
     for field in fields:
         value = getattr(material, field.name)
@@ -123,7 +124,7 @@ def _load_measured(name: str, words: list[str]) -> Callable:
     load, takes = FILES[name]
     if not words or "=" in words[0]:
         raise ValueError(f"{name} must name a file, {form(name)}, got {', '.join(words) or 'none'}")
-    arguments: dict[str, Any] = _assigned(name, words[1:], takes, form(name))
+    arguments: JsonObject = _assigned(name, words[1:], takes, form(name))
     if "smoothing" in arguments:
         arguments["smoothing"] = _material_number(name, "smoothing", arguments["smoothing"])
     # A name that no file has makes the loader's error message list existing ones.
@@ -206,8 +207,8 @@ def scene(
     ground: bool = False,
     refine: bool | float = True,
     outside: bool = False,
-    brdf: Any = None,
-    material: Sequence[tuple[str, Any]] = (),
+    brdf: Callable | None = None,
+    material: Sequence[tuple[str, Callable | TexturedMaterial]] = (),
     playable: bool = False,
 ) -> Scene:
     """The upright scene of the files, with the requested materials. Without meshes it is the embedded scene.
@@ -251,7 +252,7 @@ def scene(
     return refinement.divided(result, refine, vertices=None, environments=None, folder=None, progress=progress)[0]
 
 
-def example_scene(*, brdf: Any = None, playable: bool = False) -> Scene:
+def example_scene(*, brdf: Callable | None = None, playable: bool = False) -> Scene:
     """The embedded scene: chess pieces on a board."""
     pieces, light, dark = meshes.split(builtin.chess())
     matte = _matte if playable else Lambert
@@ -318,7 +319,7 @@ def camera(parts: Sequence[Part], *, azimuth: float = 20.0, elevation: float = 1
     return orbit(Scene(parts).mesh, azimuth=azimuth, elevation=elevation, width=size, height=size)
 
 
-def _with_materials(scene: Scene, materials: Sequence[tuple[str, Any]]) -> Scene:
+def _with_materials(scene: Scene, materials: Sequence[tuple[str, Callable | TexturedMaterial]]) -> Scene:
     """The scene with other materials of parts, which are named or numbered."""
     parts, names = list(scene.parts), scene.names
     for name, material in materials:

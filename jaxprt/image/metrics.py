@@ -1,7 +1,5 @@
 """Errors of an image against a reference: relative L2, PSNR and FLIP."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +10,7 @@ from jaxprt.compile import jit
 from jaxprt.image.arguments import numbers
 
 
-def _peak(value: Any) -> None:
+def _peak(value: object) -> None:
     require.number("peak", value, 1e-15, high=1e15)
 
 

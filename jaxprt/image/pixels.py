@@ -183,7 +183,9 @@ def resolve(
     return image + jnp.where(share > 0, share * background, 0)
 
 
-def by_color(share: Any, colors: int, *, axes: int = 1) -> Any:
+def by_color(
+    share: Float[Array | np.ndarray, "..."], colors: int, *, axes: int = 1
+) -> Float[Array | np.ndarray, "..."]:
     """Shares of points or pixels with a last axis that broadcasts to the colors of a picture.
 
     Shares without colors get an axis of one. Shares of three colors are averaged if the picture has another number.
@@ -248,7 +250,7 @@ def _numbers(flag: Bool[Array, " n"] | UInt8[Array, " n"], block: int) -> list[I
     return [jax.device_put(row) for row in number.reshape(-1, block)]
 
 
-def _concatenate(parts: list[tuple[Array, ...]]) -> list[Any]:
+def _concatenate(parts: list[tuple[Array, ...]]) -> list[Array | np.ndarray]:
     """Concatenated fields of all parts; outside of jax.jit in NumPy, and without most of the padding."""
     if isinstance(parts[0][0], Tracer):
         return list(parts[0])
@@ -508,7 +510,7 @@ def nearest_fragments(
     return Fragments(triangle, raster.barycentric(triangle, mesh, camera), depth)
 
 
-def seen_from_front(mesh: Mesh, camera: Camera, hidden: Any) -> Mesh:
+def seen_from_front(mesh: Mesh, camera: Camera, hidden: Bool[Array | np.ndarray, " f"] | None) -> Mesh:
     """The mesh without the triangles that the camera sees from behind and that are hidden there, `hidden`."""
     if hidden is None or (known(hidden) and not np.any(hidden)):
         return mesh
@@ -517,7 +519,7 @@ def seen_from_front(mesh: Mesh, camera: Camera, hidden: Any) -> Mesh:
     return dataclasses.replace(mesh, face=xp.where(away[:, None], 0, xp.asarray(mesh.face)))
 
 
-def _hidden_now(mesh: Mesh, camera: Camera, hidden: Any) -> Any:
+def _hidden_now(mesh: Mesh, camera: Camera, hidden: Bool[Array | np.ndarray, " f"]) -> Any:
     """Triangles of which the camera sees a back that is hidden. Padding of the mesh is not."""
     front = raster.front_faces(mesh, camera)
     xp = np if known(front, hidden) else jnp
@@ -525,7 +527,12 @@ def _hidden_now(mesh: Mesh, camera: Camera, hidden: Any) -> Any:
 
 
 def _slots(
-    mesh: Mesh, camera: Camera, samples: int, hidden: Any, occluder: Occluder, opacity: Opacity
+    mesh: Mesh,
+    camera: Camera,
+    samples: int,
+    hidden: Bool[Array | np.ndarray, " f"] | None,
+    occluder: Occluder,
+    opacity: Opacity,
 ) -> list[tuple[Int[np.ndarray, "h w s"], Float[np.ndarray, "h w s"], Float[np.ndarray, "h w s *c"]]]:
     """Triangles, depths and shares of the surfaces that samples see, from front to back; triangle -1 is background."""
     if not known(camera, mesh):

@@ -198,12 +198,12 @@ class Environment(eqx.Module):
         """The pixels of the light's file; None if it comes from no file, or has been transformed by JAX."""
         return getattr(self, "_panorama", None)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """What is copied and pickled: the texels alone."""
         return dict(self.__dict__)
 
 
-def _with_panorama(radiance: Any, panorama: Panorama | None) -> Environment:
+def _with_panorama(radiance: Array | np.ndarray, panorama: Panorama | None) -> Environment:
     """A light that remembers the pixels of its file."""
     light = Environment(radiance)
     if panorama is not None:
@@ -392,7 +392,7 @@ def _rotated_texels(light: Environment, rotation: Float[Array, "3 3"], *, sample
     return Environment(jnp.moveaxis(batched, 3, 0).reshape(radiance.shape))
 
 
-def _toward(value: Any) -> np.ndarray:
+def _toward(value: object) -> np.ndarray:
     require.finite("direction", value)
     direction = np.asarray(value, np.float64)
     if direction.shape != (3,) or not direction.any():
@@ -400,7 +400,7 @@ def _toward(value: Any) -> np.ndarray:
     return direction / np.linalg.norm(direction)
 
 
-def _colors(value: Any) -> np.ndarray:
+def _colors(value: object) -> np.ndarray:
     require.finite("radiance", value)
     color = np.asarray(value, np.float64)
     if color.shape not in ((), (1,), (3,)):
@@ -461,7 +461,7 @@ def disk_share(direction: ArrayLike | Sequence[float], *, angle: float, size: in
     return np.clip(panorama.disk_texels(_toward(direction), angle, size), 0, 1)
 
 
-def _direction(value: Any) -> Array:
+def _direction(value: object) -> Array:
     require.finite("direction", value)
     direction = require.floating(value)
     if direction.shape[-1:] != (3,):
@@ -671,11 +671,11 @@ class Sun(eqx.Module):
             raise ValueError(f"the direction of sun {self.name!r} must not be zero, got {self.direction}")
 
 
-def _light(value: Any) -> None:
+def _light(value: object) -> None:
     require.kind("the light", value, Environment, source="jaxprt.load_environment")
 
 
-def _suns(value: Any) -> tuple[Sun, ...]:
+def _suns(value: object) -> tuple[Sun, ...]:
     if not isinstance(value, Sequence) or isinstance(value, str | bytes):
         raise TypeError(f"suns must be a list of suns, got {require.shown(value)}")
     for sun in value:

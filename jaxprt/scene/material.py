@@ -15,6 +15,8 @@ from jaxprt.compile import jit, known
 from jaxprt.scene import texture
 from jaxprt.scene.mesh import BLEND, CLEAR, Opacity
 
+Fields = dict[str, Any]  # of a `TexturedMaterial`, by name
+
 _COLORS = "base_color", "emissive", "specular_color", "sheen_color"
 ALPHA_MODES = "opaque", "mask", "blend"
 BACKS = "black", "hidden", "lit"
@@ -28,7 +30,7 @@ def _scalar(value: Any) -> Any:
     return require.floating(value, dtype=jnp.result_type(float))
 
 
-def _color(value: Any) -> Any:
+def _color(value: object) -> Any:
     """A number or a color as an array of shape [3]. What is known stays known while JAX traces."""
     value = _scalar(value)
     if not isinstance(value, jax.Array) or value.ndim:
@@ -350,7 +352,7 @@ def opacity_of_parts(parts: Sequence[Any]) -> Opacity | None:
     total = sum(len(part.mesh.position) for part in parts)
     coordinate, factor = np.zeros((total, 2), np.float32), np.ones(total, np.float32)
     layer, rows, texels, first = np.zeros(total, np.int32), [_OPAQUE], [np.ones(1, np.float32)], 0
-    place: dict[Any, int] = {}
+    place: dict[tuple, int] = {}
     for part, glass, through in zip(parts, glasses, clear, strict=True):
         span = slice(first, first + len(part.mesh.position))
         first = span.stop
@@ -394,7 +396,7 @@ def _glass(part: Any) -> _Glass | None:
     return _Glass(share * luminance, color / luminance) if share * luminance > CLEAR else None
 
 
-def _mean(factor: Any, image: Texture | None) -> Float[np.ndarray, " _"]:
+def _mean(factor: Array | np.ndarray | float, image: Texture | None) -> Float[np.ndarray, " _"]:
     value = np.atleast_1d(np.asarray(factor, np.float64))
     return value if image is None else value * np.asarray(image.image, np.float64).mean((0, 1))
 

@@ -177,7 +177,7 @@ class PointLight(eqx.Module):
         return np.clip((cosine - outer) / max(inner - outer, _EDGE), 0, 1) ** 2
 
 
-def _tuple(items: Any) -> tuple:
+def _tuple(items: object) -> tuple:
     """A sequence as a tuple."""
     if isinstance(items, eqx.Module | str | bytes) or not isinstance(items, Iterable):
         lists = "parts, cameras, environments, point_lights and suns"
@@ -185,7 +185,7 @@ def _tuple(items: Any) -> tuple:
     return tuple(items)
 
 
-def _align_parts(parts: Any) -> tuple:
+def _align_parts(parts: object) -> tuple:
     """Parts whose meshes have one origin. Values that are not parts pass; the scene refuses them."""
     parts = _tuple(parts)
     if not all(isinstance(part, Part) for part in parts):

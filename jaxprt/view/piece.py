@@ -7,10 +7,11 @@ import pathlib
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from jaxprt import require
 from jaxprt.files import outputs
+from jaxprt.files.inputs import JsonObject
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment
 from jaxprt.view import browser, messages, page_error
@@ -194,7 +195,7 @@ def _page(
     session: Session,
     reduced: PageScene,
     lights: Mapping[str, Environment],
-    contents: tuple[dict[str, Any], list[bytes]],
+    contents: tuple[JsonObject, list[bytes]],
     skies: Sequence[Reply | None] = (),
     *,
     error: float,
@@ -239,7 +240,7 @@ def _skies(session: Session, room: int | float) -> list[Reply | None]:
     return [None] * len(shown)
 
 
-def _free_parameters(free: dict[str, Any]) -> dict[str, Any]:
+def _free_parameters(free: JsonObject) -> JsonObject:
     """What users of the page can change of a part, of what they can change in the viewer."""
     result = dict(free)
     if "roughness" in free:

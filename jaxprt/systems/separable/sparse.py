@@ -7,7 +7,6 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,7 +16,7 @@ from jaxtyping import Array, Float, Int, Shaped, UInt, UInt8
 
 from jaxprt import require, visibility
 from jaxprt.compile import jit, linear, total
-from jaxprt.files.arrays import Layout, sketch
+from jaxprt.files.arrays import Header, Layout, sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.systems.separable.factorization import SeparableBrdf, mark_of
@@ -317,7 +316,7 @@ class _Job(visibility.rays.VisibilityJob):
     keep: int
 
     @property
-    def header(self) -> Mapping[str, Any]:
+    def header(self) -> Header:
         return self.made_by("separable", ALGORITHM, maps=self.brdf.coordinates.__name__, keep=self.keep)
 
     @property

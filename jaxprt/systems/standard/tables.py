@@ -9,11 +9,11 @@ import functools
 import pathlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from jaxprt import require
@@ -233,7 +233,7 @@ def _read(name: str) -> Mapping[str, np.ndarray]:
 
 
 @functools.cache
-def _lobes(table: StandardTable, count: int, dtype: Any) -> LobeBrdf:
+def _lobes(table: StandardTable, count: int, dtype: DTypeLike) -> LobeBrdf:
     if count not in table.counts:
         with jax.ensure_compile_time_eval():
             return lobe.tabulate(table.family, lobes=count, knot=(np.asarray(table._stored["knot"]),))
@@ -248,7 +248,7 @@ def _lobes(table: StandardTable, count: int, dtype: Any) -> LobeBrdf:
 
 
 @functools.cache
-def _tensor(table: StandardTable, lobes: int, ranks: tuple[int, int, int] | None, dtype: Any) -> DynamicBrdf:
+def _tensor(table: StandardTable, lobes: int, ranks: tuple[int, int, int] | None, dtype: DTypeLike) -> DynamicBrdf:
     if not table.has_tensor(lobes, ranks):
         with jax.ensure_compile_time_eval():
             knot = (np.asarray(table._stored["knot"]),)
@@ -263,7 +263,7 @@ def _tensor(table: StandardTable, lobes: int, ranks: tuple[int, int, int] | None
 
 
 @functools.cache
-def _harmonics(table: StandardTable, degree: int, dtype: Any) -> HarmonicBrdf:
+def _harmonics(table: StandardTable, degree: int, dtype: DTypeLike) -> HarmonicBrdf:
     stored = table._stored
     value = constant(stored["harmonics"][: (degree + 1) ** 2], dtype=dtype)
     return HarmonicBrdf(
@@ -272,18 +272,18 @@ def _harmonics(table: StandardTable, degree: int, dtype: Any) -> HarmonicBrdf:
 
 
 @functools.cache
-def _paths(table: StandardTable, dtype: Any) -> tuple[SeparableBrdf, FunctionWeights]:
+def _paths(table: StandardTable, dtype: DTypeLike) -> tuple[SeparableBrdf, FunctionWeights]:
     names = "light", "view", "factor", "error"
     light, view, factor, error = (constant(table._stored[f"path.{name}"], dtype=dtype) for name in names)
     knot = (constant(table._stored["knot"], dtype=dtype),)
     return SeparableBrdf(light, view, error, hemisphere.parabolic_coordinates), FunctionWeights(knot, factor)
 
 
-def _dtype() -> Any:
+def _dtype() -> DTypeLike:
     return jnp.result_type(float)
 
 
-def constant(value: np.ndarray, *, dtype: Any = None) -> jax.Array:
+def constant(value: np.ndarray, *, dtype: DTypeLike | None = None) -> jax.Array:
     """An array on the device, also while JAX traces a function. No program is compiled."""
     with jax.ensure_compile_time_eval():
         return jax.device_put(np.asarray(value, _dtype() if dtype is None else dtype))
