@@ -101,6 +101,12 @@ def floating(value: object, *, dtype: Any = None) -> Any:
         return jax.device_put(known)  # jnp.asarray would be a program for each shape.
 
 
+def repeated(value: object, length: int) -> Any:
+    """The result of `floating` in the default type, with one number alone repeated."""
+    value = floating(value, dtype=jnp.result_type(float))
+    return jnp.broadcast_to(value, (length,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
+
+
 def _float_type(dtype: Any) -> Any:
     """The type of floating point for numbers of a type."""
     if not jnp.issubdtype(dtype, jnp.floating):

@@ -270,7 +270,7 @@ class Ward(Model):
         return jnp.where(both_above(wi, wo), self.diffuse / jnp.pi + lobe, 0)
 
 
-class WardDuer(Model):
+class WardDuer(Ward):
     """Ward's model with Duer's normalization, as fitted to measurements by Ngan et al.
 
     The lobe is specular exp(-tan^2 / m^2) / (4 pi m^2 cos_i cos_o), with two roughnesses like `Ward`. For small
@@ -284,13 +284,6 @@ class WardDuer(Model):
 
     Reference: Duer 2006, "An improved normalization for the Ward reflectance model"; Ngan, Durand, Matusik 2005.
     """
-
-    lobe_width: ClassVar = {"along": 1, "across": 1}
-
-    diffuse: Float[Array, " c"] = eqx.field(converter=color, default=0.5)
-    specular: Float[Array, " c"] = eqx.field(converter=color, default=0.3)
-    along: Float[Array, ""] = eqx.field(converter=scalar, default=0.2)
-    across: Float[Array, ""] = eqx.field(converter=scalar, default=0.2)
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the BRDF in 1/sr."""

@@ -1,5 +1,7 @@
 """Errors of an image against a reference: relative L2, PSNR and FLIP."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,9 +11,7 @@ from jaxprt import require
 from jaxprt.compile import jit
 from jaxprt.image.arguments import numbers
 
-
-def _peak(value: object) -> None:
-    require.number("peak", value, 1e-15, high=1e15)
+_peak = functools.partial(require.number, "peak", low=1e-15, high=1e15)
 
 
 @require.arguments(image=numbers("the image"), reference=numbers("the reference"))

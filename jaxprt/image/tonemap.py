@@ -96,16 +96,9 @@ def _by(matrix: np.ndarray | tuple, x: Pixels, xp: ModuleType) -> Pixels:
     return xp.stack([sum(float(w) * x[..., k] for k, w in enumerate(row)) for row in matrix], -1)
 
 
-def _stops(value: object) -> None:
-    require.number("stops", value, -STOPS, high=STOPS)
-
-
-def _percentile(value: object) -> None:
-    require.number("percentile", value, 0.0, high=100.0)
-
-
-def _white(value: object) -> None:
-    require.number("white", value, 1e-15, high=1e15)
+_stops = functools.partial(require.number, "stops", low=-STOPS, high=STOPS)
+_percentile = functools.partial(require.number, "percentile", low=0.0, high=100.0)
+_white = functools.partial(require.number, "white", low=1e-15, high=1e15)
 
 
 @require.arguments(radiance=numbers("the radiance"), stops=_stops)

@@ -4,7 +4,6 @@ import functools
 import pathlib
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -211,8 +210,7 @@ def _with_panorama(radiance: Array | np.ndarray, panorama: Panorama | None) -> E
     return light
 
 
-def _size(value: object) -> None:
-    require.count("size", value, least=1)
+_size = functools.partial(require.count, "size", least=1)
 
 
 @require.arguments(path=functools.partial(require.path, "path"), size=_size)
@@ -527,12 +525,9 @@ def background(light: Environment, direction: Float[Array, "*b 3"]) -> Float[Arr
     return cubemap.lookup(light.radiance, direction)
 
 
-def _angle(value: Any) -> Any:
-    require.at_least("angle", value, 0.0)
-    return value
-
-
-@require.arguments(light=_environment, direction=_direction, angle=_angle)
+@require.arguments(
+    light=_environment, direction=_direction, angle=functools.partial(require.at_least, "angle", least=0.0)
+)
 def sky(
     light: Environment,
     direction: Float[Array | np.ndarray, "*b 3"],
@@ -633,12 +628,6 @@ def _cut_faces(image: np.ndarray, layout: str) -> np.ndarray:
     return np.stack([face[::down, ::right] for face, (down, right) in zip(cut, steps, strict=True)])
 
 
-def _three(value: Any) -> Any:
-    """A number or three numbers as an array of shape [3]. What is not of numbers is left for the class to refuse."""
-    value = require.floating(value, dtype=jnp.result_type(float))
-    return jnp.broadcast_to(value, (3,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
-
-
 class Sun(eqx.Module):
     """A distant light of one direction, such as a directional light of a glTF file.
 
@@ -655,7 +644,7 @@ class Sun(eqx.Module):
 
     name: str = eqx.field(static=True)
     direction: Float[Array, "3"] = eqx.field(converter=require.floating)
-    irradiance: Float[Array, "3"] = eqx.field(converter=_three, default=1.0)
+    irradiance: Float[Array, "3"] = eqx.field(converter=functools.partial(require.repeated, length=3), default=1.0)
 
     def __check_init__(self):
         """Refuses values that are not finite, and directions of no length."""

@@ -3,6 +3,7 @@
 import collections
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -108,12 +109,6 @@ def _place(value: Any) -> Any:
     return jnp.broadcast_to(value, (3,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
 
 
-def _three(value: Any) -> Any:
-    """A number or three numbers as an array of shape [3]. What is not of numbers is left for the class to refuse."""
-    value = require.floating(value, dtype=jnp.result_type(float))
-    return jnp.broadcast_to(value, (3,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
-
-
 def _axis(value: Any) -> Any:
     """A direction as an array; None stays."""
     return None if value is None else require.floating(value)
@@ -139,7 +134,7 @@ class PointLight(eqx.Module):
 
     name: str = eqx.field(static=True)
     position: Float[Array | np.ndarray, "3"] = eqx.field(converter=_place)
-    intensity: Float[Array, "3"] = eqx.field(converter=_three, default=1.0)
+    intensity: Float[Array, "3"] = eqx.field(converter=partial(require.repeated, length=3), default=1.0)
     axis: Float[Array, "3"] | None = eqx.field(converter=_axis, default=None)
     cone: tuple[float, float] = eqx.field(static=True, default=(0.0, np.pi / 4))
 

@@ -148,7 +148,7 @@ class Session:
                 raise ValueError(f"systems must be of the same scene, got another scene for {name!r}")
         lights = environments
         if lights is None and self._version is None:
-            lights = _name_lights(lights_of(scene.scene))
+            lights = {f"light {number}": light for number, light in enumerate(lights_of(scene.scene), 1)}
         if lights is not None:
             _check_lights(lights)
         self._replace(by_name, lights, preview=preview)
@@ -474,10 +474,6 @@ def _size(message: Message) -> tuple[int, int, bool]:
     coarse = messages.truth(message, "coarse")
     step = _COARSE.get(message["kind"], 1) if coarse else 1
     return max(width // step, 1), max(height // step, 1), coarse
-
-
-def _name_lights(lights: Sequence[Environment]) -> dict[str, Environment]:
-    return {f"light {number}": light for number, light in enumerate(lights, 1)}
 
 
 def _stops(message: Message) -> float | None:

@@ -141,14 +141,9 @@ class StandardTable:
         """
         return _tensor(self, int(lobes), None if ranks is None else tuple(ranks), _dtype())
 
-    @property
-    def has_paths(self) -> bool:
-        """Whether the functions of light paths are shipped."""
-        return "path.view" in self._stored
-
     def paths(self) -> tuple[SeparableBrdf, FunctionWeights]:
         """The functions with which parts send light to others, and their weights over roughness."""
-        if not self.has_paths:
+        if "path.view" not in self._stored:
             raise ValueError(f"no functions of light paths are shipped for {self.name}")
         return _paths(self, _dtype())
 
@@ -181,7 +176,8 @@ class StandardTable:
             size: Edge of the cubemap faces in texels.
         """
         knot = self._stored["samples.knot"]
-        place = max(log_roughness, self.range[0]) + np.log(size / TEXELS) / self._power
+        power = 2 if self.name == "metallic_roughness" else 1  # the width of lobes is proportional to that of roughness
+        place = max(log_roughness, self.range[0]) + np.log(size / TEXELS) / power
         return int(self._stored["samples"][max(int(np.searchsorted(knot, place + 1e-6)) - 1, 0)])
 
     def is_sharp(self, log_roughness: float, weight: Float[np.ndarray, " k"] | None = None) -> bool:
@@ -198,11 +194,6 @@ class StandardTable:
         albedo = self._stored["albedo"].astype(np.float64)
         albedo = albedo.sum(2) if weight is None else albedo @ np.asarray(weight, np.float64)
         return np.array([np.interp(log_roughness, self._stored["knot"], row) for row in albedo])
-
-    @property
-    def _power(self) -> int:
-        """Power of the roughness to which the width of lobes is proportional."""
-        return 2 if self.name == "metallic_roughness" else 1
 
     @property
     def _stored(self) -> Mapping[str, np.ndarray]:
