@@ -88,6 +88,13 @@ def neighbors(place: Float[Array, "*v"], *, size: int) -> tuple[Int[Array, "*v"]
     return low.astype(jnp.int32), place - low
 
 
+def among(
+    knots: Sequence[Float[Array, " _"]], parameter: Sequence[Float[Array, "*v"]]
+) -> list[tuple[Int[Array, "*v"], Float[Array, "*v"]]]:
+    """The `neighbors` of the values of each parameter among its knots."""
+    return [neighbors(place(knot, value), size=len(knot)) for knot, value in zip(knots, parameter, strict=True)]
+
+
 def read(row: Float[Array, "r *q"], axis: Sequence[tuple[Int[Array, " v"], Float[Array, " v"]]]) -> Float[Array, "r v"]:
     """Rows of a table, interpolated multilinearly along each axis of nodes."""
     count = len(axis[0][0])

@@ -16,9 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from jaxprt import brdf
 from jaxprt.brdf import AshikhminShirley, Lambert
@@ -30,6 +28,7 @@ from jaxprt.scene.camera import orbit
 from jaxprt.scene.environment import rotate
 from jaxprt.scene.formats.mesh_file import SUFFIXES
 from jaxprt.scene.scene import default_camera, unique_names
+from jaxprt.view.stages import about
 
 # Loader of each kind of file, and its further options: True for required ones.
 FILES: dict[str, tuple[Callable, dict[str, bool]]] = {
@@ -298,12 +297,6 @@ def unique(names: Sequence[str]) -> list[str]:
 def rotate_light(light: Environment, degrees: float) -> Environment:
     """A light rotated about the vertical, counterclockwise as seen from above."""
     return light if degrees % 360 == 0 else rotate(light, about(float(np.radians(degrees))))
-
-
-def about(angle: float) -> Float[Array, "3 3"]:
-    """Rotation matrix about the vertical by an angle in radians, from +z towards +x."""
-    c, s = np.cos(angle), np.sin(angle)
-    return jnp.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]], jnp.result_type(float))
 
 
 def camera(parts: Sequence[Part], *, azimuth: float = 20.0, elevation: float = 15.0, size: int = 512) -> Camera:

@@ -264,7 +264,7 @@ def straight(color: Float[np.ndarray, "h w c"], alpha: Float[np.ndarray, "h w 1"
 
 
 def about(angle: float) -> Float[Array, "3 3"]:
-    """Rotation matrix about +y by an angle in radians."""
+    """Rotation matrix about the vertical by an angle in radians, from +z towards +x."""
     c, s = np.cos(angle), np.sin(angle)
     return jnp.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]], jnp.result_type(float))
 

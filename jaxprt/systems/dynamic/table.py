@@ -107,10 +107,7 @@ class DynamicBrdf(eqx.Module):
         if not self.terms:
             return jnp.zeros((0, self.channels, len(parameter[0])), self.factor.dtype)
         rows = jnp.moveaxis(self.factor.reshape(*self.factor.shape[:-2], -1), -1, 0)
-        axis = [
-            grid.neighbors(grid.place(knot, value), size=len(knot))
-            for knot, value in zip(self.knot, parameter, strict=True)
-        ]
+        axis = grid.among(self.knot, parameter)
         return jnp.swapaxes(grid.read(rows, axis).reshape(self.channels, -1, len(parameter[0])), 0, 1)
 
     def at(self, *parameter: Float[Array, ""]) -> "DynamicBrdf":

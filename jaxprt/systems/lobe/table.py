@@ -122,8 +122,7 @@ class LobeBrdf(eqx.Module):
             needed = f"{len(self.knot)} parameters, got {len(parameter)}"
             raise ValueError(f"the table needs {needed}; a system takes them in its materials, as `Blend.parameter`")
         result = self
-        for knot, value in zip(self.knot, parameter, strict=True):
-            low, upper = grid.neighbors(grid.place(knot, value), size=len(knot))
+        for knot, (low, upper) in zip(self.knot, grid.among(self.knot, parameter), strict=True):
             result = _mean(result, jnp.zeros_like(knot).at[low].set(1 - upper).at[low + 1].set(upper))
         return result
 
@@ -154,10 +153,7 @@ class LobeBrdf(eqx.Module):
             axis = [grid.neighbors(spot[:, i], size=resolution) for i in (1, 0)]
         nodes = self.scale.shape[1:]
         rows = [array.reshape(-1, *nodes) for array in (self.mean, self.scale, self.weight, self.diffuse)]
-        place = [
-            grid.neighbors(grid.place(knot, value), size=len(knot))
-            for knot, value in zip(self.knot, parameter, strict=True)
-        ]
+        place = grid.among(self.knot, parameter)
         if place:
             entry = _entries_between(jnp.concatenate(rows), place, axis, lobes=self.lobes)
             mean, scale, strength, diffuse = (jnp.moveaxis(column, 0, -1) for column in entry)
