@@ -160,7 +160,7 @@ def _quoted(start: bytes) -> str:
     return f"the bytes {start.hex(' ')}"
 
 
-def _attributes(spec: OpenImageIO.ImageSpec) -> Attributes:
+def _attributes(spec: Any) -> Attributes:
     return {attribute.name: attribute.value for attribute in spec.extra_attribs}
 
 

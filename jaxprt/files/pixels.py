@@ -5,6 +5,7 @@ import pathlib
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import OpenImageIO
@@ -71,7 +72,7 @@ class DamageError(Exception):
 
 
 @contextlib.contextmanager
-def opened(path: pathlib.Path) -> Iterator[OpenImageIO.ImageInput]:
+def opened(path: pathlib.Path) -> Iterator[Any]:
     """OpenImageIO's reader of a file, an `OpenImageIO.ImageInput`; DamageError if there is none."""
     config = OpenImageIO.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)  # Otherwise colors come premultiplied by alpha.
@@ -85,12 +86,12 @@ def opened(path: pathlib.Path) -> Iterator[OpenImageIO.ImageInput]:
 
 
 def read(
-    reader: OpenImageIO.ImageInput,
+    reader: Any,
     name: str,
     *,
     part: int = 0,
     channels: Sequence[str] | None = None,
-    window: OpenImageIO.ROI | None = None,
+    window: Any = None,
     decoder: int = 0,
 ) -> Float32[np.ndarray, "h w c"]:
     """Reads an image, if it has the right size and fits into memory, at the finest level.
@@ -135,7 +136,7 @@ def read(
 
 
 def blocks(
-    reader: OpenImageIO.ImageInput, *, part: int = 0, channels: Sequence[int], form: str
+    reader: Any, *, part: int = 0, channels: Sequence[int], form: str
 ) -> Iterator[tuple[range, Num[np.ndarray, "h w c"]]]:
     """Blocks of rows of an image, counted from 0, with the channels of some indices in a type of OpenImageIO's name."""
     spec = reader.spec()
@@ -156,13 +157,13 @@ def blocks(
         yield rows, values[..., [index - span[0] for index in channels]]
 
 
-def _block_rows(spec: OpenImageIO.ImageSpec) -> int:
+def _block_rows(spec: Any) -> int:
     """Rows that are read at once: whole rows of tiles, which may be larger than the image."""
     height, _ = _chunk_size(spec)
     return -(-max(1, _VALUES // (spec.width * spec.nchannels)) // height) * height
 
 
-def _chunk_size(spec: OpenImageIO.ImageSpec) -> tuple[int, int]:
+def _chunk_size(spec: Any) -> tuple[int, int]:
     """Height and width of what a decoder unpacks at once: tiles, or scan lines that are compressed together."""
     if spec.tile_width:
         return spec.tile_height, spec.tile_width
