@@ -389,13 +389,13 @@ def shared_size(count: int, *, fine: bool = False) -> int:
     return -(-count >> shift) << shift
 
 
-def put(value: Any) -> Any:
+def put(value: PyTree) -> PyTree:
     """Arrays of the host on the device, without a program, and also while JAX traces a function."""
     with compile_time():
         return jax.tree.map(lambda leaf: jax.device_put(leaf) if isinstance(leaf, np.ndarray) else leaf, value)
 
 
-def compile_time(*value: Any) -> contextlib.AbstractContextManager:
+def compile_time(*value: PyTree) -> contextlib.AbstractContextManager:
     """A context in which operations on known arrays are executed at once, even while JAX traces a function.
 
     Nothing changes if JAX traces one of the given values.
@@ -405,6 +405,6 @@ def compile_time(*value: Any) -> contextlib.AbstractContextManager:
     return jax.ensure_compile_time_eval()
 
 
-def known(*value: Any) -> bool:
+def known(*value: PyTree) -> bool:
     """Whether JAX traces none of the arrays."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value))

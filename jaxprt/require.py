@@ -22,6 +22,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 Function = TypeVar("Function", bound=Callable)
+Kind = TypeVar("Kind")
 
 LARGEST = 1e32  # magnitude of numbers that enter: sums over all texels and small factors fit into float32
 _ORTHOGONAL = 1e-4  # deviation of M M^T from the identity, due to rounding
@@ -29,7 +30,7 @@ _MOST = 2**31 - 1  # largest index of 32 bits
 _AXES = 64  # most axes of an array in NumPy
 
 
-def real(name: str, value: Any) -> None:
+def real(name: str, value: object) -> None:
     """Refuses anything but real numbers: text, booleans, complex numbers, masked arrays, None and other objects.
 
     Numbers, nested lists of them, NumPy and JAX arrays pass. The type is checked inside `jax.jit` too.
@@ -39,7 +40,7 @@ def real(name: str, value: Any) -> None:
         raise TypeError(f"{name} must be real numbers, got {wrong}")
 
 
-def unreal(value: Any) -> str:
+def unreal(value: object) -> str:
     """What a value is that does not consist of real numbers; empty if it does."""
     if isinstance(value, np.ma.MaskedArray):
         return "a masked array: fill its masked values first"
@@ -56,7 +57,7 @@ def unreal(value: Any) -> str:
     return names.get(getattr(known.dtype, "kind", ""), f"values of type {known.dtype}")
 
 
-def _array_of(value: Any) -> Any:
+def _array_of(value: object) -> Any:
     """Converts a value to an array of NumPy, or of JAX for lists of values inside `jax.jit`; None if it cannot."""
     if isinstance(value, jax.Array | np.ndarray | np.generic):
         return value
@@ -69,7 +70,7 @@ def _array_of(value: Any) -> Any:
     return None
 
 
-def _is_too_deep(value: Any) -> bool:
+def _is_too_deep(value: object) -> bool:
     """Whether lists hold themselves, or are nested more deeply than arrays have axes."""
     level = [value]
     for _ in range(_AXES + 1):
@@ -77,7 +78,7 @@ def _is_too_deep(value: Any) -> bool:
     return bool(level)
 
 
-def floating(value: Any, *, dtype: Any = None) -> Any:
+def floating(value: object, *, dtype: Any = None) -> Any:
     """Real numbers as a JAX array of floating point, for the fields of classes.
 
     Half precision becomes float32, because sums over the sphere overflow in it. float64 stays only where the caller has
@@ -100,6 +101,12 @@ def floating(value: Any, *, dtype: Any = None) -> Any:
         return jax.device_put(known)  # jnp.asarray would be a program for each shape.
 
 
+def repeated(value: object, length: int) -> Any:
+    """The result of `floating` in the default type, with one number alone repeated."""
+    value = floating(value, dtype=jnp.result_type(float))
+    return jnp.broadcast_to(value, (length,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
+
+
 def _float_type(dtype: Any) -> Any:
     """The type of floating point for numbers of a type."""
     if not jnp.issubdtype(dtype, jnp.floating):
@@ -108,7 +115,7 @@ def _float_type(dtype: Any) -> Any:
     return jax.dtypes.canonicalize_dtype(wide)
 
 
-def finite(name: str, value: Any) -> None:
+def finite(name: str, value: object) -> None:
     """Refuses anything but real numbers, and refuses NaN, infinity and numbers above 1e32 in magnitude.
 
     Sums of products of larger numbers overflow in float32, and differences of infinities are NaN.
@@ -126,7 +133,7 @@ def finite(name: str, value: Any) -> None:
     _require(name, f"at most {LARGEST:g} in magnitude", known, lambda known: np.abs(known) <= LARGEST)
 
 
-def at_least(name: str, value: Any, least: float, *, slack: float = 0.0) -> None:
+def at_least(name: str, value: object, least: float, *, slack: float = 0.0) -> None:
     """Refuses what `finite` refuses, and values below a bound.
 
     `slack` is a tolerance for rounding errors.
@@ -135,13 +142,13 @@ def at_least(name: str, value: Any, least: float, *, slack: float = 0.0) -> None
     _require(name, f"at least {least:g}", value, lambda known: known >= least - slack)
 
 
-def within(name: str, value: Any, low: int, high: int) -> None:
+def within(name: str, value: object, low: int, high: int) -> None:
     """Refuses arrays with integers outside a range."""
     real(name, value)
     _require(name, f"between {low} and {high}", value, lambda known: (known >= low) & (known <= high))
 
 
-def _require(name: str, what: str, value: Any, fits: Callable[[np.ndarray], Any]) -> None:
+def _require(name: str, what: str, value: object, fits: Callable[[np.ndarray], Any]) -> None:
     """Refuses numbers of which some do not fit, unless JAX traces them."""
     known = _array_of(value)
     if isinstance(known, Tracer):
@@ -156,7 +163,7 @@ def _require(name: str, what: str, value: Any, fits: Callable[[np.ndarray], Any]
     )
 
 
-def position(name: str, value: Any, *, points: int | None = None) -> Array:
+def position(name: str, value: object, *, points: int | None = None) -> Array:
     """Refuses values that are not a finite position. The shape is checked inside `jax.jit` too.
 
     Args:
@@ -185,7 +192,7 @@ def colors(name: str, radiance: Any) -> None:
         raise ValueError(f"{name} must have 1 or 3 colors, got {np.shape(radiance)[-1]}")
 
 
-def rotation(name: str, value: Any) -> Array:
+def rotation(name: str, value: object) -> Array:
     """Refuses anything but a proper rotation matrix [3 3]. Inside `jax.jit` only its shape is checked.
 
     Returns:
@@ -221,22 +228,23 @@ def number(name: str, value: Any, low: float, *, high: float = LARGEST, above: b
         raise ValueError(f"{name} must be {'above' if above else 'at least'} {low:g} and at most {high:g}, got {value}")
 
 
-def whole(name: str, value: Any) -> None:
-    """Refuses anything but a whole number, by TypeError."""
+def whole(name: str, value: object) -> int:
+    """The value if it is a whole number; others are refused by TypeError."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name} must be a whole number, got {shown(value)}")
+    return int(value)
 
 
-def count(name: str, value: Any, *, least: int = 0, most: int = _MOST) -> None:
+def count(name: str, value: object, *, least: int = 0, most: int = _MOST) -> None:
     """Refuses anything but a whole number (TypeError) within a range (ValueError)."""
-    whole(name, value)
-    if not least <= value <= most:
-        bound = f"at least {least}" if value < least else f"at most {most}"
+    size = whole(name, value)
+    if not least <= size <= most:
+        bound = f"at least {least}" if size < least else f"at most {most}"
         bound = bound if most == _MOST else f"between {least} and {most}"
         raise ValueError(f"{name} must be {bound}, got {value}")
 
 
-def path(name: str, value: Any) -> None:
+def path(name: str, value: object) -> None:
     """Refuses anything but the name of a file or folder, as text or a path, by TypeError."""
     if not isinstance(value, str | os.PathLike):
         raise TypeError(f"{name} must be a path, as text or pathlib.Path, got {shown(value)}")
@@ -244,7 +252,7 @@ def path(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be a path, got {shown(value)}")
 
 
-def executor(value: Any) -> None:
+def executor(value: object) -> None:
     """Refuses anything but None and objects with the method `submit` of `concurrent.futures.Executor`, by TypeError."""
     if value is not None and not callable(getattr(value, "submit", None)):
         raise TypeError(
@@ -252,7 +260,7 @@ def executor(value: Any) -> None:
         )
 
 
-def function(name: str, value: Any) -> None:
+def function(name: str, value: object) -> None:
     """Refuses anything but None and a function, by TypeError."""
     if value is not None and not callable(value):
         raise TypeError(f"{name} must be a function or None, got {shown(value)}")
@@ -321,14 +329,15 @@ def _host_memory() -> int | None:
         return free
 
 
-def kind(name: str, value: Any, *wanted: type, source: str) -> None:
-    """Refuses objects that are not of the wanted classes, by TypeError."""
-    if not isinstance(value, wanted):
-        names = " or ".join(kind.__name__ for kind in wanted)
-        raise TypeError(f"{name} must be of class {names}, which {source} makes, got {_describe(value)}")
+def kind(name: str, value: object, *wanted: type[Kind], source: str) -> Kind:
+    """The value if it is of one of the wanted classes; others are refused by TypeError."""
+    if isinstance(value, wanted):
+        return value
+    names = " or ".join(kind.__name__ for kind in wanted)
+    raise TypeError(f"{name} must be of class {names}, which {source} makes, got {_describe(value)}")
 
 
-def array(name: str, value: Any, *axes: str, source: str = "") -> None:
+def array(name: str, value: object, *axes: str, source: str = "") -> None:
     """Refuses anything but arrays (TypeError) of an allowed shape (ValueError).
 
     `axes` are the shapes, such as "v 3", in which letters stand for any size.
@@ -379,13 +388,13 @@ def _fits(shape: tuple[int, ...], axes: list[str]) -> bool:
     )
 
 
-def _describe(value: Any) -> str:
+def _describe(value: object) -> str:
     if isinstance(value, jax.Array | np.ndarray):
         return f"an array of shape {list(value.shape)}"
     return f"one of class {type(value).__name__}"
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """A value in at most 40 letters, and its class."""
     if isinstance(value, jax.Array | np.ndarray):
         return _describe(value)

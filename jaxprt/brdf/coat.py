@@ -24,7 +24,7 @@ from jaxprt.brdf.models import scalar
 _F0 = 0.04
 
 
-def coat_reflectance(cosine: Any) -> Any:
+def coat_reflectance(cosine: Float[Array | np.ndarray, "*b"] | float) -> Float[Array | np.ndarray, "*b"] | float:
     """Reflectance of a coat for views at some cosines to the normal, by Schlick's approximation."""
     xp = np if isinstance(cosine, np.ndarray | float) else jnp
     away = 1 - xp.clip(cosine, 0, 1)

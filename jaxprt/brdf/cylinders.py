@@ -148,7 +148,7 @@ class PoulinFournier(Model):
         return _mirror(theta, left, self.distance - right, self.distance)
 
 
-class PoulinFournierGrooves(Model):
+class PoulinFournierGrooves(PoulinFournier):
     """Grooves that cylinders of radius 1, parallel to the tangent, cut into a plane.
 
     Attributes:
@@ -158,19 +158,6 @@ class PoulinFournierGrooves(Model):
         distance: Distance between neighboring axes, in radii, above 0. Grooves wider than this intersect.
         height: Height of the axes above the plane, in radii: 0 for half cylinders, 1 for a flat plane.
     """
-
-    lobe_width: ClassVar = {"exponent": -2}
-    least: ClassVar = {"distance": _GRAZING, "height": -jnp.inf}
-
-    diffuse: Float[Array, " c"] = eqx.field(converter=color, default=0.3)
-    specular: Float[Array, " c"] = eqx.field(converter=color, default=0.5)
-    exponent: Float[Array, ""] = eqx.field(converter=scalar, default=100.0)
-    distance: Float[Array, ""] = eqx.field(converter=scalar, default=2.0)
-    height: Float[Array, ""] = eqx.field(converter=scalar, default=0.0)
-
-    def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
-        """Value of the BRDF in 1/sr."""
-        return _reflect(self, wi, wo, self._arc, self._plane)
 
     def _edge(self) -> Array:
         """Angle at which an arc ends: at the plane, or where it meets its neighbor."""

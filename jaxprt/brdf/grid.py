@@ -22,7 +22,7 @@ def as_argument(brdf: Callable) -> Callable:
     return jax.tree_util.Partial(brdf) if jax.tree_util.all_leaves([brdf]) else brdf
 
 
-def check(brdf: Any) -> None:
+def check(brdf: object) -> None:
     """Refuses anything but a function of two directions that returns real numbers.
 
     Raises:
@@ -86,6 +86,13 @@ def neighbors(place: Float[Array, "*v"], *, size: int) -> tuple[Int[Array, "*v"]
     place = jnp.clip(place, 0, size - 1)
     low = jax.lax.stop_gradient(jnp.clip(jnp.floor(place), 0, size - 2))
     return low.astype(jnp.int32), place - low
+
+
+def among(
+    knots: Sequence[Float[Array, " _"]], parameter: Sequence[Float[Array, "*v"]]
+) -> list[tuple[Int[Array, "*v"], Float[Array, "*v"]]]:
+    """The `neighbors` of the values of each parameter among its knots."""
+    return [neighbors(place(knot, value), size=len(knot)) for knot, value in zip(knots, parameter, strict=True)]
 
 
 def read(row: Float[Array, "r *q"], axis: Sequence[tuple[Int[Array, " v"], Float[Array, " v"]]]) -> Float[Array, "r v"]:

@@ -19,10 +19,10 @@ Heitz 2014, "Understanding the masking-shadowing function in microfacet-based BR
 anisotropic D and G; Burley 2012, "Physically based shading at Disney", for alpha = roughness^2.
 """
 
-from typing import Any, ClassVar
+from functools import partial
+from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -35,10 +35,7 @@ from jaxprt.compile import jit
 _SMOOTHEST = 1e-3  # smallest alpha, because a perfect mirror has no density
 
 
-def _both_axes(value: Any) -> Any:
-    """One number for both tangent axes, or two numbers, as an array of shape [2]."""
-    value = scalar(value)
-    return jnp.broadcast_to(value, (2,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
+_both_axes = partial(require.repeated, length=2)  # one number for both tangent axes, or two numbers
 
 
 def _alpha(roughness: Array) -> Array:

@@ -23,18 +23,18 @@ _GRAZING = 1e-4  # smallest cosine in half vectors and denominators
 _SMOOTHEST = 1e-3  # smallest roughness, because a perfect mirror has no density
 
 
-def color(value: Any) -> Any:
+def color(value: object) -> Any:
     """A scalar or a color as an array of shape [1] or [3]. What is not of numbers is left for the class to refuse."""
     value = scalar(value)
     return jnp.atleast_1d(value) if isinstance(value, jax.Array) and not value.ndim else value
 
 
-def scalar(value: Any) -> Any:
+def scalar(value: object) -> Any:
     """A number as an array of shape []. What is not of numbers is left for the class to refuse."""
     return require.floating(value, dtype=jnp.result_type(float))
 
 
-def _lobes(value: Any) -> Any:
+def _lobes(value: object) -> Any:
     """One number or color per lobe as an array of shape [l, 1] or [l, 3]."""
     value = scalar(value)
     return value[..., None] if isinstance(value, jax.Array) and value.ndim == 1 else value
@@ -270,7 +270,7 @@ class Ward(Model):
         return jnp.where(both_above(wi, wo), self.diffuse / jnp.pi + lobe, 0)
 
 
-class WardDuer(Model):
+class WardDuer(Ward):
     """Ward's model with Duer's normalization, as fitted to measurements by Ngan et al.
 
     The lobe is specular exp(-tan^2 / m^2) / (4 pi m^2 cos_i cos_o), with two roughnesses like `Ward`. For small
@@ -284,13 +284,6 @@ class WardDuer(Model):
 
     Reference: Duer 2006, "An improved normalization for the Ward reflectance model"; Ngan, Durand, Matusik 2005.
     """
-
-    lobe_width: ClassVar = {"along": 1, "across": 1}
-
-    diffuse: Float[Array, " c"] = eqx.field(converter=color, default=0.5)
-    specular: Float[Array, " c"] = eqx.field(converter=color, default=0.3)
-    along: Float[Array, ""] = eqx.field(converter=scalar, default=0.2)
-    across: Float[Array, ""] = eqx.field(converter=scalar, default=0.2)
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the BRDF in 1/sr."""

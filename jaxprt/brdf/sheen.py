@@ -29,6 +29,8 @@ from jaxprt import require
 from jaxprt.brdf.microfacet import MetallicRoughness
 from jaxprt.brdf.models import Model, both_above, color, half_vector, scalar
 
+Numbers = Float[Array | np.ndarray, "..."]
+
 SMOOTHEST = 0.1  # smaller roughness is treated as this one
 _TINY = 1e-20
 # Coefficients a to e of l, each where alpha is 1 and where it is 0. Between, they are linear in (1 - alpha)^2.
@@ -44,13 +46,13 @@ _RINGS, _SECTORS = 48, 48  # of its quadrature; half of the sectors are computed
 _LOWEST = 0.991  # tan(theta / 2) of the last view, half a degree above the horizon and used as if it were on it
 
 
-def _masking(cosine: Any, alpha: Any) -> Any:
+def _masking(cosine: Numbers, alpha: Numbers | float) -> Numbers:
     """L of the module's equation."""
     xp = np if isinstance(cosine, np.ndarray) else jnp
     smooth = (1 - alpha) ** 2
     a, b, c, d, e = (rough + (other - rough) * smooth for rough, other in _MASKING)
 
-    def exponent(x: Any) -> Any:
+    def exponent(x):
         return a / (1 + b * x**c) + d * x + e
 
     near = cosine < 0.5
@@ -58,7 +60,7 @@ def _masking(cosine: Any, alpha: Any) -> Any:
     return xp.exp(xp.where(near, exponent(low), 2 * exponent(0.5 + 0 * high) - exponent(1 - high)))
 
 
-def _value(sine2: Any, cos_i: Any, cos_o: Any, roughness: Any) -> Any:
+def _value(sine2: Numbers, cos_i: Numbers, cos_o: Numbers, roughness: Numbers | float) -> Numbers:
     """D V, given the squared sine of the half vector to the normal."""
     xp = np if isinstance(sine2, np.ndarray) else jnp
     alpha = xp.maximum(roughness, SMOOTHEST) ** 2
@@ -105,7 +107,7 @@ def _albedos() -> Float[np.ndarray, "r v"]:
     return np.stack(rows)
 
 
-def sheen_albedo(cosine: Float[Array | np.ndarray, "*b"], roughness: Any) -> Any:
+def sheen_albedo(cosine: Float[Array | np.ndarray, "*b"], roughness: Numbers | float) -> Any:
     """E of the module's equation: albedo of a sheen of color 1, at most 1.
 
     Args:
@@ -115,7 +117,7 @@ def sheen_albedo(cosine: Float[Array | np.ndarray, "*b"], roughness: Any) -> Any
     Returns:
         The albedo [*b], interpolated in a table: .009 off at most, half a degree above the horizon.
     """
-    xp: Any = np if isinstance(cosine, np.ndarray) else jnp
+    xp = np if isinstance(cosine, np.ndarray) else jnp
     table = xp.asarray(_albedos(), cosine.dtype)
     cosine = xp.clip(cosine, 0, 1)
     across = xp.sqrt(xp.maximum((1 - cosine) / (1 + cosine), _TINY)) * (_ANGLES - 1)

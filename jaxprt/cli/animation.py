@@ -10,13 +10,13 @@ import tqdm
 
 from jaxprt import files, image
 from jaxprt.brdf import BlinnPhong, CookTorrance
-from jaxprt.cli.inputs import about
 from jaxprt.cli.report import View
 from jaxprt.relit import RelitScene
 from jaxprt.relit.channels import Changeable, Shading, roughness_range
 from jaxprt.scene import Camera
 from jaxprt.scene.environment import rotate
 from jaxprt.systems import standard
+from jaxprt.view.stages import about
 
 ROUGHNESS = (0.05, 0.5)  # between which materials move: smooth ones become rougher, and rough ones smoother
 _MIDDLE = 0.25  # roughness from which on a material is rough

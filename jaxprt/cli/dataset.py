@@ -15,7 +15,6 @@ import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import click
 import jax.numpy as jnp
@@ -25,6 +24,7 @@ import tqdm
 from jaxprt import files, image
 from jaxprt.cli import inputs, options
 from jaxprt.files import outputs
+from jaxprt.files.inputs import JsonObject
 from jaxprt.relit import RelitScene
 from jaxprt.relit.build import precompute
 from jaxprt.relit.exact import exact_pixels
@@ -317,7 +317,7 @@ def _write(path: Path, picture: dict[str, np.ndarray], *, stops: float) -> None:
     files.write_png(path, np.concatenate([shown, alpha], -1))
 
 
-def _pack(path: Path, folder: Path, rows: Sequence[dict[str, Any]]) -> None:
+def _pack(path: Path, folder: Path, rows: Sequence[JsonObject]) -> None:
     """Writes a tar file with each picture and its line of the manifest, without times and owners."""
     with outputs.replacing(path) as new, tarfile.open(new, "w", format=tarfile.USTAR_FORMAT) as archive:
         for row in rows:

@@ -5,12 +5,12 @@ import os
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import click
 
 from jaxprt.cli import inputs, options
 from jaxprt.files import outputs
+from jaxprt.files.inputs import JsonObject
 from jaxprt.relit import RelitScene
 from jaxprt.relit.build import precompute
 from jaxprt.scene import Environment, light_probe
@@ -116,7 +116,7 @@ def _check(path: Path) -> None:
 
 def _write(
     path: Path, kind: str, scene: RelitScene, lights: dict[str, Environment], chosen: SimpleNamespace
-) -> tuple[str, dict[str, Any], str]:
+) -> tuple[str, JsonObject, str]:
     """Writes a scene. Returns the kind of the file, and its description as JSON and as text."""
     if kind == "page":
         piece = export(scene, path, environments=lights, most=chosen.most, error=chosen.error)

@@ -9,17 +9,18 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import click
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 import jaxprt
 from jaxprt import brdf, compile
 from jaxprt.cli import inputs, options
 from jaxprt.files import inputs as regular
 from jaxprt.files import read_image
+from jaxprt.files.inputs import JsonObject
 from jaxprt.scene import TexturedMaterial, load_environment, load_scene
 from jaxprt.scene.environment import layout_of
 from jaxprt.scene.mesh import bounds
@@ -75,7 +76,7 @@ def command(chosen: SimpleNamespace) -> options.Result:
     return options.Result(facts, text, ValueError("\n".join(refused)) if refused else None)
 
 
-def _installation() -> dict[str, Any]:
+def _installation() -> JsonObject:
     """Describes this installation, as JSON: versions, the device, and wrong sums of its compiler."""
     device = jax.devices()[0]
     return {
@@ -88,7 +89,7 @@ def _installation() -> dict[str, Any]:
     }
 
 
-def describe_path(path: Path, light_size: int, *, outside: bool) -> dict[str, Any]:
+def describe_path(path: Path, light_size: int, *, outside: bool) -> JsonObject:
     """Describes the content of a file or folder, as JSON."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -102,7 +103,7 @@ def describe_path(path: Path, light_size: int, *, outside: bool) -> dict[str, An
     return options.finite({"path": path, **facts, **left_out})
 
 
-def _scene(path: Path, outside: bool) -> dict[str, Any]:
+def _scene(path: Path, outside: bool) -> JsonObject:
     scene = load_scene(path, outside=outside)
     parts = [
         {
@@ -123,7 +124,7 @@ def _scene(path: Path, outside: bool) -> dict[str, Any]:
     return {"kind": "scene", **total, "bounds": bounds(scene.mesh), "parts": parts, "cameras": cameras}
 
 
-def _light(path: Path, size: int) -> dict[str, Any]:
+def _light(path: Path, size: int) -> JsonObject:
     image, attributes = read_image(path)
     light = np.asarray(load_environment(path, size=size).radiance, float)
     solid = np.asarray(cubemap.solid_angle(size=size), float)
@@ -143,7 +144,7 @@ def _light(path: Path, size: int) -> dict[str, Any]:
     }
 
 
-def _brdf(path: Path) -> dict[str, Any]:
+def _brdf(path: Path) -> JsonObject:
     """Describes a file of BRDFs, whose format is recognized from its content."""
     regular.check(path, "a mesh, an environment or a BRDF")
     with path.open("rb") as file:
@@ -171,14 +172,14 @@ def _brdf(path: Path) -> dict[str, Any]:
     )
 
 
-def _materials(form: str, path: Path, names: list[str]) -> dict[str, Any]:
+def _materials(form: str, path: Path, names: list[str]) -> JsonObject:
     """Describes a file of several BRDFs, of which the first must be one."""
     model = type(inputs.FILES[form][0](path, names[0])).__name__
     facts = {"kind": "brdf", "form": form, "materials": names, "use": f"{form}:{path},material={names[0]}"}
     return facts | ({"model": model} if form == "ngan" else {})
 
 
-def _folder(path: Path) -> dict[str, Any]:
+def _folder(path: Path) -> JsonObject:
     """Describes a saved object, a store of blocks, or a folder that contains such objects or stores."""
     nbytes = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
     if (path / "object.json").exists() or (path / "store.json").exists():
@@ -193,7 +194,7 @@ def _folder(path: Path) -> dict[str, Any]:
     return {"kind": "folder", "bytes": nbytes, "inside": members}
 
 
-def _describe_store(path: Path, nbytes: int) -> dict[str, Any]:
+def _describe_store(path: Path, nbytes: int) -> JsonObject:
     """Describes a saved object or a store of blocks."""
     if (path / "object.json").exists():
         tree = json.loads(regular.json_object(path / "object.json", "the description of an object")["content"])["tree"]
@@ -215,7 +216,7 @@ def _finished_blocks(path: Path, blocks: int) -> int:
     return int(np.count_nonzero(np.frombuffer(sums[: len(sums) // 4 * 4], np.uint32)))
 
 
-def _rows(facts: dict[str, Any]) -> Iterator[str]:
+def _rows(facts: JsonObject) -> Iterator[str]:
     """The description as rows of text."""
     head, *rows = {"scene": _scene_rows, "environment": _light_rows, "brdf": _brdf_rows}.get(
         facts["kind"], _folder_rows
@@ -226,7 +227,7 @@ def _rows(facts: dict[str, Any]) -> Iterator[str]:
     yield from (f"  {row}" for row in rows)
 
 
-def _scene_rows(facts: dict[str, Any]) -> Iterator[str]:
+def _scene_rows(facts: JsonObject) -> Iterator[str]:
     counts = "{vertices} vertices, {triangles} triangles"
     size = " x ".join(f"{high - low:.4g}" for low, high in zip(*facts["bounds"], strict=True))
     head = f"scene of {len(facts['parts'])} parts, {counts.format(**facts)}"
@@ -241,19 +242,19 @@ def _scene_rows(facts: dict[str, Any]) -> Iterator[str]:
         yield f"camera {number}: at {_value(camera['eye'])}, {angle} degrees high"
 
 
-def _matters(name: str, value: Any) -> bool:
+def _matters(name: str, value: ArrayLike) -> bool:
     """Whether a parameter of a material differs from its default in glTF."""
     default = inputs.describe(TexturedMaterial())
     return name not in default or not np.array_equal(value, default[name])
 
 
-def _value(value: Any) -> str:
+def _value(value: object) -> str:
     if isinstance(value, list):
         return "/".join(map(_value, value))
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _light_rows(facts: dict[str, Any]) -> list[str]:
+def _light_rows(facts: JsonObject) -> list[str]:
     width, height = facts["pixels"]
     least, most = facts["radiance"].values()
     shares = ", ".join(f"{n}: {100 * share:.1f} %" for n, share in facts["brightest_share"].items())
@@ -265,7 +266,7 @@ def _light_rows(facts: dict[str, Any]) -> list[str]:
     ]
 
 
-def _brdf_rows(facts: dict[str, Any]) -> Iterator[str]:
+def _brdf_rows(facts: JsonObject) -> Iterator[str]:
     names = facts.get("materials", [])
     if facts["form"] == "scattered":
         yield f"scattered measurements, {facts['samples']} samples"
@@ -279,7 +280,7 @@ def _brdf_rows(facts: dict[str, Any]) -> Iterator[str]:
     yield f"use: --brdf {facts['use']}"
 
 
-def _folder_rows(facts: dict[str, Any]) -> list[str]:
+def _folder_rows(facts: JsonObject) -> list[str]:
     size = f"{facts['bytes']:,} bytes"
     if facts["kind"] == "folder":
         return [f"folder of {len(facts['inside'])} objects and stores, {size}"]

@@ -16,12 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from jaxprt import brdf
 from jaxprt.brdf import AshikhminShirley, Lambert
+from jaxprt.files.inputs import JsonObject
 from jaxprt.relit import refinement, registry
 from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial, builtin, load_environment, load_scene
 from jaxprt.scene import mesh as meshes
@@ -29,6 +28,7 @@ from jaxprt.scene.camera import orbit
 from jaxprt.scene.environment import rotate
 from jaxprt.scene.formats.mesh_file import SUFFIXES
 from jaxprt.scene.scene import default_camera, unique_names
+from jaxprt.view.stages import about
 
 # Loader of each kind of file, and its further options: True for required ones.
 FILES: dict[str, tuple[Callable, dict[str, bool]]] = {
@@ -103,9 +103,9 @@ def of_part(text: str) -> tuple[str, str]:
     return part, material
 
 
-def describe(material: Any) -> dict[str, Any]:
+def describe(material: object) -> JsonObject:
     """A material as JSON: its model, parameters and textures."""
-    result: dict[str, Any] = {"model": type(material).__name__}
+    result: JsonObject = {"model": type(material).__name__}
     fields = dataclasses.fields(material) if dataclasses.is_dataclass(material) else ()
     for field in fields:
         value = getattr(material, field.name)
@@ -123,7 +123,7 @@ def _load_measured(name: str, words: list[str]) -> Callable:
     load, takes = FILES[name]
     if not words or "=" in words[0]:
         raise ValueError(f"{name} must name a file, {form(name)}, got {', '.join(words) or 'none'}")
-    arguments: dict[str, Any] = _assigned(name, words[1:], takes, form(name))
+    arguments: JsonObject = _assigned(name, words[1:], takes, form(name))
     if "smoothing" in arguments:
         arguments["smoothing"] = _material_number(name, "smoothing", arguments["smoothing"])
     # A name that no file has makes the loader's error message list existing ones.
@@ -206,8 +206,8 @@ def scene(
     ground: bool = False,
     refine: bool | float = True,
     outside: bool = False,
-    brdf: Any = None,
-    material: Sequence[tuple[str, Any]] = (),
+    brdf: Callable | None = None,
+    material: Sequence[tuple[str, Callable | TexturedMaterial]] = (),
     playable: bool = False,
 ) -> Scene:
     """The upright scene of the files, with the requested materials. Without meshes it is the embedded scene.
@@ -251,7 +251,7 @@ def scene(
     return refinement.divided(result, refine, vertices=None, environments=None, folder=None, progress=progress)[0]
 
 
-def example_scene(*, brdf: Any = None, playable: bool = False) -> Scene:
+def example_scene(*, brdf: Callable | None = None, playable: bool = False) -> Scene:
     """The embedded scene: chess pieces on a board."""
     pieces, light, dark = meshes.split(builtin.chess())
     matte = _matte if playable else Lambert
@@ -299,12 +299,6 @@ def rotate_light(light: Environment, degrees: float) -> Environment:
     return light if degrees % 360 == 0 else rotate(light, about(float(np.radians(degrees))))
 
 
-def about(angle: float) -> Float[Array, "3 3"]:
-    """Rotation matrix about the vertical by an angle in radians, from +z towards +x."""
-    c, s = np.cos(angle), np.sin(angle)
-    return jnp.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]], jnp.result_type(float))
-
-
 def camera(parts: Sequence[Part], *, azimuth: float = 20.0, elevation: float = 15.0, size: int = 512) -> Camera:
     """A camera that sees some parts of a scene.
 
@@ -318,7 +312,7 @@ def camera(parts: Sequence[Part], *, azimuth: float = 20.0, elevation: float = 1
     return orbit(Scene(parts).mesh, azimuth=azimuth, elevation=elevation, width=size, height=size)
 
 
-def _with_materials(scene: Scene, materials: Sequence[tuple[str, Any]]) -> Scene:
+def _with_materials(scene: Scene, materials: Sequence[tuple[str, Callable | TexturedMaterial]]) -> Scene:
     """The scene with other materials of parts, which are named or numbered."""
     parts, names = list(scene.parts), scene.names
     for name, material in materials:

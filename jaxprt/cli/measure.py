@@ -2,11 +2,11 @@
 
 import sys
 from types import SimpleNamespace
-from typing import Any
 
 import click
 
 from jaxprt.cli import inputs, options, report
+from jaxprt.files.inputs import JsonObject
 from jaxprt.relit.build import precompute
 from jaxprt.relit.measuring import Report
 from jaxprt.scene import Part, Scene, builtin
@@ -66,7 +66,7 @@ def _scene(chosen: SimpleNamespace) -> options.Result:
     return options.Result({"lights": list(lights), "systems": reports}, "\n".join(texts))
 
 
-def _content(summary: Report, lights: list[str]) -> dict[str, Any]:
+def _content(summary: Report, lights: list[str]) -> JsonObject:
     """A report as JSON."""
 
     def errors(values: tuple[float, ...]) -> dict[str, float]:

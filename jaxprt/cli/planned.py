@@ -3,10 +3,10 @@
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 from jaxprt.cli import inputs, options
 from jaxprt.files import objects
+from jaxprt.files.inputs import JsonObject
 from jaxprt.relit.build import precompute
 from jaxprt.relit.planning import ERROR, Candidate, Plan, key_of, plan
 
@@ -65,10 +65,10 @@ def load(folder: Path) -> Plan:
     return plan
 
 
-def _content(result: Plan) -> dict[str, Any]:
+def _content(result: Plan) -> JsonObject:
     """A plan as JSON."""
 
-    def candidate(option: Candidate) -> dict[str, Any]:
+    def candidate(option: Candidate) -> JsonObject:
         values = {"error": option.error, "seconds": option.seconds, "bytes": option.nbytes}
         sizes = {"system": type(option.recipe).__name__, **vars(option.recipe)}
         return {"recipe": sizes, **values, "precompute_seconds": option.precompute_seconds}

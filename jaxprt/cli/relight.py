@@ -15,6 +15,7 @@ import jaxprt
 from jaxprt.cli import animation, inputs, options, planned, report
 from jaxprt.cli.report import View
 from jaxprt.files import outputs
+from jaxprt.files.inputs import JsonObject
 from jaxprt.image.tonemap import TONES
 from jaxprt.relit import RelitScene
 from jaxprt.relit.planning import Plan
@@ -147,9 +148,9 @@ def _share(view: View, chosen: SimpleNamespace, systems: tuple[str, ...], plan: 
 
 def _precompute(
     system: str, view: View, chosen: SimpleNamespace, plan: Plan | None
-) -> dict[str, tuple[RelitScene, dict[str, Any]]]:
+) -> dict[str, tuple[RelitScene, JsonObject]]:
     """The scene, precomputed by one system or by several sizes of it, and the costs."""
-    wanted: dict[str, Any] = {"bounces": chosen.bounces, "executor": chosen.part}
+    wanted: JsonObject = {"bounces": chosen.bounces, "executor": chosen.part}
     if system != "planned":
         recipes = options.recipes(system, chosen)
     elif plan is not None:
@@ -163,7 +164,7 @@ def _precompute(
     return {name: report.make(view, recipe, path, **wanted) for name, recipe in recipes.items()}
 
 
-def _describe(view: View, chosen: SimpleNamespace) -> dict[str, Any]:
+def _describe(view: View, chosen: SimpleNamespace) -> JsonObject:
     """The head of the report: scene, lights, machine and versions."""
     paths, lights = inputs.split_files(chosen.files)
     names = inputs.unique([path.stem for path in lights])
@@ -187,7 +188,7 @@ def _describe(view: View, chosen: SimpleNamespace) -> dict[str, Any]:
     }
 
 
-def _text(summary: dict[str, Any], output: Path) -> str:
+def _text(summary: JsonObject, output: Path) -> str:
     """The report as text."""
     exact, rows = summary["exact"], []
     for name, light in summary["lights"].items():

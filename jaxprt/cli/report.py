@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxprt import files, image, relit, visibility
 from jaxprt.files import objects
+from jaxprt.files.inputs import JsonObject
 from jaxprt.image import pixels
 from jaxprt.relit import measuring
 from jaxprt.relit.channels import Shading, of_part
@@ -70,7 +71,7 @@ class Truth(NamedTuple):
 
 def make(
     view: View, recipe: Recipe | Mapping[str, Recipe] | None, output: Path, **options: Any
-) -> tuple[RelitScene, dict[str, Any]]:
+) -> tuple[RelitScene, JsonObject]:
     """Precomputes a scene by one recipe, by one for each part, or by a plan. Finished work is kept in a folder.
 
     Returns:
@@ -142,7 +143,7 @@ def _visible_vertices(view: View) -> list[Int[np.ndarray, " _"]]:
     return [vertex[(vertex >= low) & (vertex < high)] - low for low, high in itertools.pairwise(first)]
 
 
-def compare(view: View, scenes: dict[str, RelitScene], output: Path) -> dict[str, Any]:
+def compare(view: View, scenes: dict[str, RelitScene], output: Path) -> JsonObject:
     """Writes all pictures. Returns the part of the report on the exact sum, and each system's errors under each light.
 
     Args:
@@ -186,7 +187,7 @@ def compare(view: View, scenes: dict[str, RelitScene], output: Path) -> dict[str
 
 def _errors(
     view: View, number: int, scene: RelitScene, drawn: Float[np.ndarray, "l h w c"], truth: Truth
-) -> dict[str, Any]:
+) -> JsonObject:
     """Relative L2 errors of a picture and of vertices, and the number of vertices with negative radiance."""
     light = list(view.lights.values())[number]
     color = scene.radiance(light, eye=jnp.asarray(view.camera.eye))[scene.file_vertex]
@@ -231,7 +232,7 @@ def times(view: View, scene: RelitScene) -> dict[str, float]:
     }
 
 
-def tables(view: View, systems: Sequence[str], count: int) -> tuple[list[dict[str, Any]], int]:
+def tables(view: View, systems: Sequence[str], count: int) -> tuple[list[JsonObject], int]:
     """Errors of systems at several sizes on some vertices of the first part that face the eye, and their number."""
     mesh, eye, lights = view.scene.parts[0].mesh, view.camera.eye, list(view.lights.values())
     facing = np.flatnonzero(np.sum(np.asarray(mesh.normal * (eye - mesh.position)), 1) > 0)
@@ -254,14 +255,14 @@ def tables(view: View, systems: Sequence[str], count: int) -> tuple[list[dict[st
     return rows, len(vertex)
 
 
-def row_text(row: dict[str, Any]) -> str:
+def row_text(row: JsonObject) -> str:
     """A row of a table as text."""
     return "  ".join(
         f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()
     )
 
 
-def _separable(shading: Shading, target: Target) -> Iterator[tuple[dict[str, Any], System]]:
+def _separable(shading: Shading, target: Target) -> Iterator[tuple[JsonObject, System]]:
     """Systems with several numbers of terms and kept coefficients."""
     full: Any = relit.Terms(max(TABLE_TERMS), max(TABLE_KEEP)).make(shading, target)
     for terms, keep in itertools.product(TABLE_TERMS, TABLE_KEEP):
@@ -270,7 +271,7 @@ def _separable(shading: Shading, target: Target) -> Iterator[tuple[dict[str, Any
             yield {"terms": terms, "keep": keep}, SeparableSystem(short, full.brdf.truncate(terms))
 
 
-def _harmonic(shading: Shading, target: Target) -> Iterator[tuple[dict[str, Any], System]]:
+def _harmonic(shading: Shading, target: Target) -> Iterator[tuple[JsonObject, System]]:
     """Systems of several degrees, with and without a window."""
     full = harmonic.precompute(shading.mesh, degree=max(TABLE_DEGREES), **target.traced("matrices"))
     brdf = harmonic_table(shading, degree=max(TABLE_DEGREES))
@@ -280,7 +281,7 @@ def _harmonic(shading: Shading, target: Target) -> Iterator[tuple[dict[str, Any]
         yield {"degree": degree, "laplacian": laplacian}, HarmonicSystem(short, brdf.truncate(degree=degree), laplacian)
 
 
-def _lobe(shading: Shading, target: Target) -> Iterator[tuple[dict[str, Any], System]]:
+def _lobe(shading: Shading, target: Target) -> Iterator[tuple[JsonObject, System]]:
     """Systems with several numbers of lobes and single texels."""
     seen = visibility.precompute(shading.mesh, size=target.size, **target.traced("visibility"))
     target = dataclasses.replace(target, known=Known(seen))
@@ -288,7 +289,7 @@ def _lobe(shading: Shading, target: Target) -> Iterator[tuple[dict[str, Any], Sy
         yield {"lobes": lobes, "texels": texels}, relit.Lobes(lobes, texels).make(shading, target)
 
 
-TABLES: dict[str, Callable[[Shading, Target], Iterator[tuple[dict[str, Any], System]]]] = {
+TABLES: dict[str, Callable[[Shading, Target], Iterator[tuple[JsonObject, System]]]] = {
     "separable": _separable,
     "harmonic": _harmonic,
     "lobe": _lobe,

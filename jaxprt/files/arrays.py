@@ -27,6 +27,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import filelock
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxprt.files import inputs, outputs
 
@@ -140,6 +141,9 @@ def read_into(file: Any, value: np.ndarray) -> None:
         left = left[count:]
 
 
+Header = Mapping[str, Any]  # of a store: what its arrays are computed from
+
+
 class Layout(NamedTuple):
     """Shape of one block of an array, and the axis along which blocks follow each other."""
 
@@ -167,7 +171,7 @@ class BlockStore:
     def __init__(
         self,
         path: str | os.PathLike,
-        header: Mapping[str, Any],
+        header: Header,
         layout: Mapping[str, Layout],
         blocks: int,
         near: Mapping[str, list[float]] | None = None,
@@ -292,7 +296,7 @@ class BlockStore:
         return value
 
 
-def sketch(array: Any, *, tolerance: float = 1e-3) -> list[float]:
+def sketch(array: ArrayLike, *, tolerance: float = 1e-3) -> list[float]:
     """A short fingerprint of an array that tolerates rounding: its norm, and sums of its values with random signs.
 
     The distance between the sums of two arrays approximates the distance between the arrays.
@@ -323,7 +327,7 @@ def _signs(count: int) -> np.ndarray:
     return np.random.default_rng(0).choice(np.array([-1, 1], np.int8), count)
 
 
-def _create(path: Path, header: Mapping[str, Any], files: Mapping[str, tuple[tuple[int, ...], str]]) -> None:
+def _create(path: Path, header: Header, files: Mapping[str, tuple[tuple[int, ...], str]]) -> None:
     """Creates an empty store."""
     try:
         with outputs.new_folder(path) as new:
@@ -336,7 +340,7 @@ def _create(path: Path, header: Mapping[str, Any], files: Mapping[str, tuple[tup
             raise
 
 
-def _check_store(path: Path, header: Mapping[str, Any], near: Mapping[str, list[float]]) -> str:
+def _check_store(path: Path, header: Header, near: Mapping[str, list[float]]) -> str:
     """Refuses a store of other inputs. Returns the key of the store."""
     try:
         # Files are also written, so a link in a folder from a stranger could replace other files of the user.
@@ -385,7 +389,7 @@ def _offset(path: Path, name: str, shape: tuple[int, ...], dtype: str) -> int:
         ) from error
 
 
-def _check_near(path: Path, stored: Any, near: Mapping[str, list[float]]) -> None:
+def _check_near(path: Path, stored: object, near: Mapping[str, list[float]]) -> None:
     """Refuses a store whose input arrays differ from these by more than rounding."""
     if not isinstance(stored, Mapping) or sorted(stored) != sorted(near):
         told = sorted(stored) if isinstance(stored, Mapping) else stored

@@ -20,6 +20,8 @@ from jaxprt import require
 from jaxprt.files import inputs, pixels
 
 # Sets of channels that are read from EXR files; the first that matches is used. Other channels, as of depth, are none.
+Attributes = dict[str, Any]  # by name, as the header of an image file has them
+
 _CHANNELS = (("R", "G", "B", "A"), ("R", "G", "B"), ("Y", "A"), ("Y",))
 _ENVIRONMENT = {"LatLong Environment": "latlong", "CubeFace Environment": "cube"}  # OpenImageIO's words for envmap
 _LONGEST = 2**20  # bytes of a header; longer ones are taken for damage
@@ -55,7 +57,7 @@ _WEBP = b"RIFF", b"WEBP"  # the first four bytes, and those from the eighth on
 
 
 @require.arguments(path=partial(require.path, "path"))
-def read_image(path: str | pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], dict[str, Any]]:
+def read_image(path: str | pathlib.Path) -> tuple[Float32[np.ndarray, "h w c"], Attributes]:
     """Reads an image file as linear values.
 
     The format (EXR, Radiance HDR, PNG, JPEG, TIFF, PFM, BMP, WebP or KTX 2) is recognized from the first bytes of the
@@ -128,9 +130,7 @@ def _format(start: bytes) -> str | None:
     return next((form for magic, form in _MAGIC if start.startswith(magic)), None)
 
 
-def _read(
-    path: pathlib.Path, name: str, *, decoded: bool | None
-) -> tuple[Float32[np.ndarray, "h w c"], dict[str, Any]]:
+def _read(path: pathlib.Path, name: str, *, decoded: bool | None) -> tuple[Float32[np.ndarray, "h w c"], Attributes]:
     """The pixels and attributes of a file; `decoded` is None where the file says whether they are encoded."""
     with path.open("rb") as file:
         start = file.read(16)
@@ -160,11 +160,11 @@ def _quoted(start: bytes) -> str:
     return f"the bytes {start.hex(' ')}"
 
 
-def _attributes(spec: Any) -> dict[str, Any]:
+def _attributes(spec: Any) -> Attributes:
     return {attribute.name: attribute.value for attribute in spec.extra_attribs}
 
 
-def _read_exr(path: pathlib.Path, name: str) -> tuple[Float32[np.ndarray, "h w c"], dict[str, Any]]:
+def _read_exr(path: pathlib.Path, name: str) -> tuple[Float32[np.ndarray, "h w c"], Attributes]:
     """Pixels of the display window of the first part with colors, in linear Rec. 709, and the part's attributes."""
     with pixels.opened(path) as reader:
         parts = []
@@ -215,7 +215,7 @@ def _color_part(parts: list[Any], name: str) -> tuple[int, tuple[str, ...]]:
     return index, channels
 
 
-def _exr_matrix(attributes: dict[str, Any], name: str) -> np.ndarray | None:
+def _exr_matrix(attributes: Attributes, name: str) -> np.ndarray | None:
     """The matrix to Rec. 709 from the primaries that a header states; None if it states none or those."""
     stated = attributes.get("chromaticities")
     if stated is None:
@@ -225,7 +225,7 @@ def _exr_matrix(attributes: dict[str, Any], name: str) -> np.ndarray | None:
     return None if stated is None else pixels.to_rec709(stated, f"the chromaticities of {name}")
 
 
-def _read_radiance(content: bytes, name: str) -> tuple[Float32[np.ndarray, "h w 3"], dict[str, Any]]:
+def _read_radiance(content: bytes, name: str) -> tuple[Float32[np.ndarray, "h w 3"], Attributes]:
     """Radiance in linear Rec. 709, the right way up, and the variables of the header."""
     head, *rest = re.split(rb"\n\r?\n", content[:_LONGEST], maxsplit=1)
     line = _RESOLUTION.match(rest[0]) if rest else None
@@ -261,9 +261,9 @@ def _read_radiance(content: bytes, name: str) -> tuple[Float32[np.ndarray, "h w 
     return pixels.upright(image, orientation), attributes
 
 
-def _radiance_attributes(head: str, name: str) -> dict[str, Any]:
+def _radiance_attributes(head: str, name: str) -> Attributes:
     """The variables of a header. Exposures are cumulative, and so are color corrections."""
-    attributes: dict[str, Any] = {}
+    attributes: Attributes = {}
     factors = {"EXPOSURE": np.ones(1), "COLORCORR": np.ones(3)}
     for text in head.split("\n")[1:]:
         key, equals, value = text.partition("=")
@@ -294,7 +294,7 @@ def _numbers(text: str, count: int, what: str) -> list[float]:
     return value
 
 
-def _radiance_factor(attributes: dict[str, Any], name: str) -> Float32[np.ndarray, "3"]:
+def _radiance_factor(attributes: Attributes, name: str) -> Float32[np.ndarray, "3"]:
     """What pixels are multiplied by to give radiance."""
     if "GAMMA" in attributes and _numbers(attributes["GAMMA"], 1, f"GAMMA of {name}") != [1.0]:
         words = f"{name} states GAMMA={attributes['GAMMA']}, which is ignored: its pixels are taken as linear"
@@ -390,7 +390,7 @@ def _read_ktx2(content: bytes, name: str, *, decoded: bool | None) -> Float32[np
 
 def _read_encoded(
     path: pathlib.Path, name: str, form: str, *, decoded: bool | None
-) -> tuple[Float32[np.ndarray, "h w c"], dict[str, Any]]:
+) -> tuple[Float32[np.ndarray, "h w c"], Attributes]:
     """Reads a format of integers, or of floating-point numbers that are used as they are."""
     chunks = pixels.png_chunks(inputs.content(path, "an image file"), name) if form == "png" else {}
     with pixels.opened(path) as reader:
@@ -419,7 +419,7 @@ def _read_encoded(
     return pixels.upright(image, orientation), attributes
 
 
-def _check_color(chunks: dict[bytes, bytes], name: str, attributes: dict[str, Any], *, whole: bool) -> float | None:
+def _check_color(chunks: dict[bytes, bytes], name: str, attributes: Attributes, *, whole: bool) -> float | None:
     """The exponent that decodes the values of a PNG file; None for sRGB. Warns of colors that are not converted."""
     gamma, words = pixels.png_color(chunks)
     if not words and "ICCProfile" in attributes:

@@ -12,6 +12,8 @@ from typing import Any
 
 from jaxprt import require
 
+JsonObject = dict[str, Any]  # by name: numbers, text, lists and objects
+
 _SHOWN = 400  # characters of a name in messages; what is longer is data
 
 
@@ -97,7 +99,7 @@ def require_inside(path: pathlib.Path, folder: pathlib.Path, *, owner: str, outs
     return path
 
 
-def store_header(folder: pathlib.Path, name: str, what: str) -> dict[str, Any]:
+def store_header(folder: pathlib.Path, name: str, what: str) -> JsonObject:
     """The header of a folder that this package wrote, or that its first versions wrote by zarr.
 
     Args:
@@ -111,7 +113,7 @@ def store_header(folder: pathlib.Path, name: str, what: str) -> dict[str, Any]:
     return json_object(folder / name, what, links=False)
 
 
-def json_object(path: pathlib.Path, what: str, *, links: bool = True) -> dict[str, Any]:
+def json_object(path: pathlib.Path, what: str, *, links: bool = True) -> JsonObject:
     """The object that a JSON file holds, with the arguments of `check`."""
     data = content(path, what, links=links)
     try:
@@ -125,7 +127,7 @@ def json_object(path: pathlib.Path, what: str, *, links: bool = True) -> dict[st
     return value
 
 
-def unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def unique_names(pairs: list[tuple[str, Any]]) -> JsonObject:
     """A JSON object from its pairs, for `json.loads`. A name that stands twice in it raises ValueError."""
     result = dict(pairs)
     if len(result) < len(pairs):

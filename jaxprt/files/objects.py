@@ -33,6 +33,7 @@ from jax.core import Tracer
 
 from jaxprt import require
 from jaxprt.files import arrays, extensions, inputs, outputs
+from jaxprt.files.inputs import JsonObject
 
 _PLAIN: dict[Any, tuple[type, ...]] = {
     bool: (bool, np.bool_),
@@ -84,7 +85,7 @@ def check(value: Any, *, batched: bool = False) -> None:
     _run_checks(value)
 
 
-def _run_checks(value: Any) -> None:
+def _run_checks(value: object) -> None:
     """Calls the checks that constructors of `equinox.Module` call: those of all base classes."""
     for base in type(value).__mro__:
         if "__check_init__" in vars(base):
@@ -103,7 +104,7 @@ def holds_models(kind: type, name: str) -> bool:
 
 
 @functools.cache
-def _hints(kind: type) -> dict[str, Any]:
+def _hints(kind: type) -> JsonObject:
     return typing.get_type_hints(kind)
 
 
@@ -149,11 +150,11 @@ def _array_fits(value: Any, hint: Any, batched: bool) -> bool:
     return isinstance(value, hint.dtype[type(value) if isinstance(value, np.ndarray) else jax.Array, axes])
 
 
-def _is_callable(hint: Any) -> bool:
+def _is_callable(hint: object) -> bool:
     return collections.abc.Callable in (hint, typing.get_origin(hint))
 
 
-def _text(hint: Any) -> str:
+def _text(hint: object) -> str:
     if inspect.isclass(hint) and issubclass(hint, jaxtyping.AbstractArray):
         return f"an array {hint.dtype.__name__}[{hint.dim_str}]"
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
@@ -166,7 +167,7 @@ def _text(hint: Any) -> str:
     return getattr(hint, "__name__", str(hint))
 
 
-def _described(value: Any) -> str:
+def _described(value: object) -> str:
     if isinstance(value, np.ndarray | jax.Array):
         return f"an array of {value.dtype} {list(value.shape)}"
     if value is None or isinstance(value, bool | int | float | str):
@@ -174,7 +175,7 @@ def _described(value: Any) -> str:
     return f"a {type(value).__name__}"
 
 
-def construct(kind: type, field: dict[str, Any]) -> Any:
+def construct(kind: type, field: JsonObject) -> Any:
     """An object with these fields. Nothing is converted, checked or called, as when JAX unflattens a pytree."""
     if not dataclasses.is_dataclass(kind):
         return tuple.__new__(kind, field.values())
@@ -234,7 +235,7 @@ class _Reader:
         name, field = _parts(node, {"class": str, "field": dict})
         return self._object(name, field, batched)
 
-    def _object(self, name: str, field: dict[str, Any], batched: bool) -> Any:
+    def _object(self, name: str, field: JsonObject, batched: bool) -> Any:
         kind = _class(name)
         if list(field) != names(kind):
             came, wanted = ", ".join(field), ", ".join(names(kind))
@@ -335,7 +336,7 @@ def algorithm_of(module: str) -> Any:
     return getattr(sys.modules.get(module), "ALGORITHM", 1)
 
 
-def function_name(value: Any) -> str | None:
+def function_name(value: object) -> str | None:
     """Name under which files store a function; None for what is not one of those functions."""
     name = f"{getattr(value, '__module__', None)}:{getattr(value, '__qualname__', None)}"
     return name if name in _FUNCTIONS else None
@@ -472,11 +473,11 @@ def reduced(object: Any) -> tuple:
     return _restore, (type(object), {key: value for key, value in field.items() if key not in name}, name)
 
 
-def _restore(kind: type, field: dict[str, Any], name: dict[str, str]) -> Any:
+def _restore(kind: type, field: JsonObject, name: dict[str, str]) -> Any:
     return construct(kind, field | {key: function(path) for key, path in name.items()})
 
 
-def _describe(value: Any, place: str, arrays: list, modules: set[str], batched: bool = False) -> dict[str, Any]:
+def _describe(value: Any, place: str, arrays: list, modules: set[str], batched: bool = False) -> JsonObject:
     """Describes a value as JSON. Appends its arrays to the list, and adds the modules of its classes to the set."""
     if value is None or type(value) in (bool, int, float, str):
         return {"value": value}
@@ -507,7 +508,7 @@ def _describe(value: Any, place: str, arrays: list, modules: set[str], batched: 
     return {"class": extensions.full_name(kind), "field": field}
 
 
-def _describe_array(value: Any, place: str, arrays: list) -> dict[str, Any]:
+def _describe_array(value: Any, place: str, arrays: list) -> JsonObject:
     if isinstance(value, Tracer):
         raise TypeError(f"{place} must have values to be saved, got one that JAX is tracing")
     if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.extended):

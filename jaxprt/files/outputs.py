@@ -182,7 +182,7 @@ def is_layer_name(name: str) -> bool:
 
 def _layer_channels(layers: Mapping[str, Any]) -> dict[str, Float[np.ndarray, "h w"]]:
     """The channels of the layers of a picture."""
-    result: dict[str, Any] = {}
+    result: dict[str, np.ndarray] = {}
     for name, layer in layers.items():
         if not isinstance(name, str) or not is_layer_name(name):
             raise ValueError(f"names of layers must be of letters, digits, spaces, - and _, got {name!r}")

@@ -1,7 +1,6 @@
 """Checks of the arguments of this folder's functions, for `require.arguments`."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import numpy as np
@@ -14,17 +13,17 @@ from jaxprt.scene.mesh import Mesh
 STOPS = 100.0  # largest exposure: 2^100 times the largest radiance fits into float32
 
 
-def a_mesh(value: Any) -> None:
+def a_mesh(value: object) -> None:
     """Refuses anything but a mesh."""
     require.kind("the mesh", value, Mesh, source="jaxprt.scene.mesh.make_mesh or jaxprt.load_mesh")
 
 
-def a_camera(value: Any) -> None:
+def a_camera(value: object) -> None:
     """Refuses anything but a camera."""
     require.kind("the camera", value, Camera, source="jaxprt.scene.camera.orbit")
 
 
-def numbers(name: str, *axes: str) -> Callable[[Any], jax.Array]:
+def numbers(name: str, *axes: str) -> Callable[[object], jax.Array]:
     """A check for arrays of real numbers without NaN. It converts lists, integers and half precision.
 
     Infinite values pass, because display clamps them.
@@ -34,7 +33,7 @@ def numbers(name: str, *axes: str) -> Callable[[Any], jax.Array]:
         axes: Allowed shapes, as `require.array` takes them; any if none are given.
     """
 
-    def check(value: Any) -> jax.Array:
+    def check(value: object) -> jax.Array:
         require.real(name, value)
         converted = require.floating(value)
         if axes:
@@ -49,19 +48,19 @@ def numbers(name: str, *axes: str) -> Callable[[Any], jax.Array]:
     return check
 
 
-def samples(value: Any) -> None:
+def samples(value: object) -> None:
     """Refuses anything but a whole number."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise ValueError(f"samples must be 1 or 4, got {require.shown(value)}")
 
 
-def color(value: Any) -> jax.Array:
+def color(value: object) -> jax.Array:
     """Refuses colors that are not of real numbers. NaN passes: vertices that no pixel shows may have it."""
     require.real("color", value)
     return require.floating(value)
 
 
-def background(value: Any) -> jax.Array | None:
+def background(value: object) -> jax.Array | None:
     """Refuses a background that is neither None nor of numbers without NaN."""
     return None if value is None else numbers("the background")(value)
 

@@ -1,6 +1,6 @@
 """Errors of an image against a reference: relative L2, PSNR and FLIP."""
 
-from typing import Any
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,7 @@ from jaxprt import require
 from jaxprt.compile import jit
 from jaxprt.image.arguments import numbers
 
-
-def _peak(value: Any) -> None:
-    require.number("peak", value, 1e-15, high=1e15)
+_peak = functools.partial(require.number, "peak", low=1e-15, high=1e15)
 
 
 @require.arguments(image=numbers("the image"), reference=numbers("the reference"))

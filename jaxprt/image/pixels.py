@@ -27,7 +27,7 @@ from jaxprt.image.raster import SAMPLES, Fragments, ray_direction
 from jaxprt.scene import environment as environments
 from jaxprt.scene.camera import Camera, in_common_coordinates
 from jaxprt.scene.environment import Environment
-from jaxprt.scene.mesh import Mesh
+from jaxprt.scene.mesh import Mesh, Opacity
 from jaxprt.visibility import Occluder
 
 SMOOTH = math.cos(math.radians(10))  # smallest cosine between mean normals of triangles that may share a point
@@ -183,7 +183,9 @@ def resolve(
     return image + jnp.where(share > 0, share * background, 0)
 
 
-def by_color(share: Any, colors: int, *, axes: int = 1) -> Any:
+def by_color(
+    share: Float[Array | np.ndarray, "..."], colors: int, *, axes: int = 1
+) -> Float[Array | np.ndarray, "..."]:
     """Shares of points or pixels with a last axis that broadcasts to the colors of a picture.
 
     Shares without colors get an axis of one. Shares of three colors are averaged if the picture has another number.
@@ -248,7 +250,7 @@ def _numbers(flag: Bool[Array, " n"] | UInt8[Array, " n"], block: int) -> list[I
     return [jax.device_put(row) for row in number.reshape(-1, block)]
 
 
-def _concatenate(parts: list[tuple[Array, ...]]) -> list[Any]:
+def _concatenate(parts: list[tuple[Array, ...]]) -> list[Array | np.ndarray]:
     """Concatenated fields of all parts; outside of jax.jit in NumPy, and without most of the padding."""
     if isinstance(parts[0][0], Tracer):
         return list(parts[0])
@@ -460,7 +462,7 @@ def visible_points(
         shown = seen_from_front(mesh, camera, hidden)
         fragments = finished(raster.rasterize(shown, camera, samples=samples), between)
         return finished(shading_points(fragments, mesh, camera, uneven=uneven), between)
-    slots = _slots(mesh, camera, samples, hidden, occluder)
+    slots = _slots(mesh, camera, samples, hidden, occluder, occluder.opacity)
     result = []
     for triangle, depth, share in slots:
         triangle, depth = (values[..., 0] if samples == 1 else values for values in (triangle, depth))
@@ -478,7 +480,7 @@ def coverage(
         fragments = raster.rasterize(seen_from_front(mesh, camera, hidden), camera, samples=samples)
         seen = jnp.asarray(fragments.triangle >= 0, jnp.result_type(float))
         return seen if seen.ndim == 2 else jnp.mean(seen, -1)
-    slots = _slots(mesh, camera, samples, hidden, occluder)
+    slots = _slots(mesh, camera, samples, hidden, occluder, occluder.opacity)
     empty = sum(np.mean(np.where(triangle < 0, _gray(share), 0), -1) for triangle, _, share in slots)
     return jnp.asarray(1 - empty, jnp.result_type(float))
 
@@ -497,7 +499,7 @@ def nearest_fragments(
     """
     if occluder is None or occluder.opacity is None:
         return raster.rasterize(seen_from_front(mesh, camera, hidden), camera)
-    slots = _slots(mesh, camera, 1, hidden, occluder)
+    slots = _slots(mesh, camera, 1, hidden, occluder, occluder.opacity)
     random = np.random.default_rng(0).random(slots[0][0].shape)
     triangle, depth, total = np.full(random.shape, -1, np.int32), np.full(random.shape, np.inf, np.float32), 0.0
     for one, where, share in slots:
@@ -508,7 +510,7 @@ def nearest_fragments(
     return Fragments(triangle, raster.barycentric(triangle, mesh, camera), depth)
 
 
-def seen_from_front(mesh: Mesh, camera: Camera, hidden: Any) -> Mesh:
+def seen_from_front(mesh: Mesh, camera: Camera, hidden: Bool[Array | np.ndarray, " f"] | None) -> Mesh:
     """The mesh without the triangles that the camera sees from behind and that are hidden there, `hidden`."""
     if hidden is None or (known(hidden) and not np.any(hidden)):
         return mesh
@@ -517,7 +519,7 @@ def seen_from_front(mesh: Mesh, camera: Camera, hidden: Any) -> Mesh:
     return dataclasses.replace(mesh, face=xp.where(away[:, None], 0, xp.asarray(mesh.face)))
 
 
-def _hidden_now(mesh: Mesh, camera: Camera, hidden: Any) -> Any:
+def _hidden_now(mesh: Mesh, camera: Camera, hidden: Bool[Array | np.ndarray, " f"]) -> Any:
     """Triangles of which the camera sees a back that is hidden. Padding of the mesh is not."""
     front = raster.front_faces(mesh, camera)
     xp = np if known(front, hidden) else jnp
@@ -525,7 +527,12 @@ def _hidden_now(mesh: Mesh, camera: Camera, hidden: Any) -> Any:
 
 
 def _slots(
-    mesh: Mesh, camera: Camera, samples: int, hidden: Any, occluder: Occluder
+    mesh: Mesh,
+    camera: Camera,
+    samples: int,
+    hidden: Bool[Array | np.ndarray, " f"] | None,
+    occluder: Occluder,
+    opacity: Opacity,
 ) -> list[tuple[Int[np.ndarray, "h w s"], Float[np.ndarray, "h w s"], Float[np.ndarray, "h w s *c"]]]:
     """Triangles, depths and shares of the surfaces that samples see, from front to back; triangle -1 is background."""
     if not known(camera, mesh):
@@ -533,12 +540,11 @@ def _slots(
             "pictures of surfaces with holes or translucent ones need concrete values, but the camera or the scene is "
             "traced by JAX: make the picture outside of jax.jit, or close the jitted function over them"
         )
-    assert occluder.opacity is not None
     count = len(occluder.face)
     clear = np.zeros(len(mesh.face), bool)
-    layer = np.asarray(occluder.opacity.layer)[occluder.face[:, 0]]
+    layer = np.asarray(opacity.layer)[occluder.face[:, 0]]
     clear[:count] = layer > 0
-    passing, glass = np.asarray(occluder.opacity.passing), np.asarray(occluder.opacity.glass)
+    passing, glass = np.asarray(opacity.passing), np.asarray(opacity.glass)
     passing = passing[layer, : 1 if np.all(passing == 1) else 3]  # shares are by color if there is colored glass
     away = np.zeros(len(mesh.face), bool) if hidden is None else _hidden_now(mesh, camera, hidden)
     opaque = dataclasses.replace(mesh, face=np.where((clear | away)[:, None], 0, np.asarray(mesh.face)))

@@ -16,6 +16,8 @@ from jaxprt import require
 from jaxprt.compile import jit
 from jaxprt.image.arguments import STOPS, numbers
 
+Pixels = Float[Array | np.ndarray, "..."]
+
 TONES = ("srgb", "filmic", "agx", "aces")
 _WHITE = 11.2  # linear value that the filmic curve maps to 1, after the doubling
 # Rows of matrices. Hill 2016: sRGB to the AP1 primaries of the RRT, and back.
@@ -43,7 +45,7 @@ _SIGMOID = (15.5, -40.14, 31.96, -6.868, 0.4298, 0.1191, -0.00232)  # its coeffi
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of linear Rec. 709 RGB
 
 
-def apply_curve(linear: Any, tone: str, xp: ModuleType) -> Any:
+def apply_curve(linear: Pixels, tone: str, xp: ModuleType) -> Pixels:
     """Applies a tone curve.
 
     Args:
@@ -59,26 +61,26 @@ def apply_curve(linear: Any, tone: str, xp: ModuleType) -> Any:
     return xp.clip(curve(xp.clip(linear, 0, 1e6), xp), 0, 1)
 
 
-def _same(x: Any, xp: ModuleType) -> Any:
+def _same(x: Pixels, xp: ModuleType) -> Pixels:
     return x
 
 
-def _filmic(x: Any, xp: ModuleType) -> Any:
+def _filmic(x: Pixels, xp: ModuleType) -> Pixels:
     """Hable 2010, Uncharted 2: HDR Lighting, with its exposure bias of 2 and white of 11.2."""
 
-    def curve(x: Any) -> Any:
+    def curve(x):
         return (x * (0.15 * x + 0.05) + 0.004) / (x * (0.15 * x + 0.5) + 0.06) - 0.02 / 0.3
 
     return curve(2 * x) / curve(_WHITE)
 
 
-def _aces(x: Any, xp: ModuleType) -> Any:
+def _aces(x: Pixels, xp: ModuleType) -> Pixels:
     """Hill 2016, a fit of the ACES reference rendering and output transforms, with the factor 1 / .6 of three.js."""
     x = _by(_ACES_IN, x / 0.6, xp)
     return _by(_ACES_OUT, (x * (x + 0.0245786) - 0.000090537) / (x * (0.983729 * x + 0.4329510) + 0.238081), xp)
 
 
-def _agx(x: Any, xp: ModuleType) -> Any:
+def _agx(x: Pixels, xp: ModuleType) -> Pixels:
     """Sobotka 2022, AgX base look; the curve is Wrensch's polynomial of 2023, as in three.js."""
     x = xp.log2(xp.maximum(_by(_INSET, xp.maximum(_by(np.linalg.inv(_TO_REC709), x, xp), 0), xp), 1e-10))
     x = xp.clip((x - _LEAST) / (_MOST - _LEAST), 0, 1)
@@ -89,21 +91,14 @@ def _agx(x: Any, xp: ModuleType) -> Any:
     return _by(_TO_REC709, y**2.2, xp)
 
 
-def _by(matrix: Any, x: Any, xp: ModuleType) -> Any:
+def _by(matrix: np.ndarray | tuple, x: Pixels, xp: ModuleType) -> Pixels:
     """A matrix times each color, in the type of the colors."""
     return xp.stack([sum(float(w) * x[..., k] for k, w in enumerate(row)) for row in matrix], -1)
 
 
-def _stops(value: Any) -> None:
-    require.number("stops", value, -STOPS, high=STOPS)
-
-
-def _percentile(value: Any) -> None:
-    require.number("percentile", value, 0.0, high=100.0)
-
-
-def _white(value: Any) -> None:
-    require.number("white", value, 1e-15, high=1e15)
+_stops = functools.partial(require.number, "stops", low=-STOPS, high=STOPS)
+_percentile = functools.partial(require.number, "percentile", low=0.0, high=100.0)
+_white = functools.partial(require.number, "white", low=1e-15, high=1e15)
 
 
 @require.arguments(radiance=numbers("the radiance"), stops=_stops)
@@ -193,7 +188,7 @@ def decode_srgb(encoded: Float[Array, "*b"]) -> Float[Array, "*b"]:
     return jnp.where(dark, encoded / 12.92, ((bright + 0.055) / 1.055) ** 2.4)
 
 
-def _tone(value: Any) -> None:
+def _tone(value: object) -> None:
     if not isinstance(value, str) or value not in TONES:
         raise ValueError(f"tone must be one of {', '.join(TONES)}, got {require.shown(value)}")
 

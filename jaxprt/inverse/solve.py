@@ -149,9 +149,9 @@ class Fit(NamedTuple):
             for a material, combinations of its unbounded variables. None with more than 512 parameters.
     """
 
-    value: Any
+    value: PyTree
     residual: np.ndarray
-    deviation: Any
+    deviation: PyTree
     determined: Float[np.ndarray, "r n"] | None
 
     @property

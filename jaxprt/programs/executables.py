@@ -19,7 +19,7 @@ import sys
 import threading
 import time
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox
@@ -38,7 +38,7 @@ _PACKAGE = pathlib.Path(__file__).parents[1]
 _STARTED = time.time()
 _KNOWN = ("builtins", "jaxprt", "equinox", "numpy", "jax", "jaxlib", "collections")  # packages whose code has a version
 _CLEAN = re.compile(r"<jax\._src\.core\.AxisEnv object at 0x[0-9a-f]+>")  # empty where no trace is under way
-_functions: list["Kept"] = []
+_functions: list["StoredFunction"] = []
 _MAPS, _MOST = pathlib.Path("/proc/self/maps"), pathlib.Path("/proc/sys/vm/max_map_count")
 _FILLED = 0.7  # share of the memory mappings at which programs are forgotten
 _FEW = 32  # new programs after which mappings are counted again, which takes milliseconds
@@ -134,8 +134,8 @@ class StoredFunction:
     def __init__(self, function: Callable, compiled: Any, static: tuple[str, ...]):
         functools.update_wrapper(self, function)
         self._function, self._compiled, self._static = function, compiled, static
-        self._executables: dict[Any, Any] = {}
-        self._locks: dict[Any, Any] = {}  # a lock for each signature
+        self._executables: dict[tuple, Callable] = {}
+        self._locks: dict[tuple, contextlib.AbstractContextManager] = {}  # a lock for each signature
         _functions.append(self)
 
     def __call__(self, *argument: PyTree, **named: Any) -> PyTree:
@@ -170,7 +170,7 @@ class StoredFunction:
         """Forgets the executables of this process. Those in files stay."""
         self._executables.clear()
 
-    def _executable(self, operand: tuple, option: dict[str, Any], tree: Any, aval: tuple) -> Callable:
+    def _executable(self, operand: tuple, option: Mapping[str, object], tree: Any, aval: tuple) -> Callable:
         """The executable from its file, or compiled and then kept."""
         argument, named = operand
         aval = tuple((shape, str(dtype), weak) for shape, dtype, weak in aval)
@@ -213,7 +213,7 @@ class _Compiled:
         self.programs = self.counted = 0
         jax.monitoring.register_event_duration_secs_listener(self._add)
 
-    def _add(self, event: str, duration_secs: float, **kwargs: Any) -> None:
+    def _add(self, event: str, duration_secs: float, **_: object) -> None:
         self.programs += event == "/jax/core/compile/backend_compile_duration"
 
 
@@ -238,7 +238,7 @@ def make_room() -> None:
             _compiled.counted = _compiled.programs
 
 
-def _concrete(leaves: Sequence[Any]) -> bool:
+def _concrete(leaves: Sequence[object]) -> bool:
     """Whether all leaves are arrays on the default device, with their values."""
     place = _place_of(jax.devices()[0])
     for leaf in leaves:
@@ -272,7 +272,7 @@ def _calls_out(lowered: Any) -> bool:
     return "custom_call" in text
 
 
-def _pack(executable: Any) -> bytes:
+def _pack(executable: jax.stages.Compiled) -> bytes:
     content, _, out = serialize_executable.serialize(executable)
     # Structures of results cannot be pickled, but results with numbers in place of arrays can.
     return zlib.compress(pickle.dumps((content, out.unflatten(range(out.num_leaves)))), 1)

@@ -66,12 +66,12 @@ class Cache(NullCache):
         return hashlib.sha256(f"{target}\n{sig}\n{describe(self._loop)}".encode()).hexdigest()
 
 
-def describe(loop: Any) -> str:
+def describe(loop: object) -> str:
     """A text that changes with all that numba compiles into a loop: its code, what it calls, and what these read."""
     return "\n".join(_texts(loop, (), set()))
 
 
-def _texts(value: Any, names: Sequence[str], seen: set) -> Iterator[str]:
+def _texts(value: object, names: Sequence[str], seen: set) -> Iterator[str]:
     """Texts of a function or of what it reads from outside, such as the attributes `names` of a module."""
     if value is None or value is ... or isinstance(value, bool | int | float | complex | str | bytes):
         yield repr(value)

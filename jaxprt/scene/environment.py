@@ -4,7 +4,6 @@ import functools
 import pathlib
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -198,12 +197,12 @@ class Environment(eqx.Module):
         """The pixels of the light's file; None if it comes from no file, or has been transformed by JAX."""
         return getattr(self, "_panorama", None)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """What is copied and pickled: the texels alone."""
         return dict(self.__dict__)
 
 
-def _with_panorama(radiance: Any, panorama: Panorama | None) -> Environment:
+def _with_panorama(radiance: Array | np.ndarray, panorama: Panorama | None) -> Environment:
     """A light that remembers the pixels of its file."""
     light = Environment(radiance)
     if panorama is not None:
@@ -211,8 +210,7 @@ def _with_panorama(radiance: Any, panorama: Panorama | None) -> Environment:
     return light
 
 
-def _size(value: object) -> None:
-    require.count("size", value, least=1)
+_size = functools.partial(require.count, "size", least=1)
 
 
 @require.arguments(path=functools.partial(require.path, "path"), size=_size)
@@ -392,7 +390,7 @@ def _rotated_texels(light: Environment, rotation: Float[Array, "3 3"], *, sample
     return Environment(jnp.moveaxis(batched, 3, 0).reshape(radiance.shape))
 
 
-def _toward(value: Any) -> np.ndarray:
+def _toward(value: object) -> np.ndarray:
     require.finite("direction", value)
     direction = np.asarray(value, np.float64)
     if direction.shape != (3,) or not direction.any():
@@ -400,7 +398,7 @@ def _toward(value: Any) -> np.ndarray:
     return direction / np.linalg.norm(direction)
 
 
-def _colors(value: Any) -> np.ndarray:
+def _colors(value: object) -> np.ndarray:
     require.finite("radiance", value)
     color = np.asarray(value, np.float64)
     if color.shape not in ((), (1,), (3,)):
@@ -461,7 +459,7 @@ def disk_share(direction: ArrayLike | Sequence[float], *, angle: float, size: in
     return np.clip(panorama.disk_texels(_toward(direction), angle, size), 0, 1)
 
 
-def _direction(value: Any) -> Array:
+def _direction(value: object) -> Array:
     require.finite("direction", value)
     direction = require.floating(value)
     if direction.shape[-1:] != (3,):
@@ -527,12 +525,9 @@ def background(light: Environment, direction: Float[Array, "*b 3"]) -> Float[Arr
     return cubemap.lookup(light.radiance, direction)
 
 
-def _angle(value: Any) -> Any:
-    require.at_least("angle", value, 0.0)
-    return value
-
-
-@require.arguments(light=_environment, direction=_direction, angle=_angle)
+@require.arguments(
+    light=_environment, direction=_direction, angle=functools.partial(require.at_least, "angle", least=0.0)
+)
 def sky(
     light: Environment,
     direction: Float[Array | np.ndarray, "*b 3"],
@@ -633,12 +628,6 @@ def _cut_faces(image: np.ndarray, layout: str) -> np.ndarray:
     return np.stack([face[::down, ::right] for face, (down, right) in zip(cut, steps, strict=True)])
 
 
-def _three(value: Any) -> Any:
-    """A number or three numbers as an array of shape [3]. What is not of numbers is left for the class to refuse."""
-    value = require.floating(value, dtype=jnp.result_type(float))
-    return jnp.broadcast_to(value, (3,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
-
-
 class Sun(eqx.Module):
     """A distant light of one direction, such as a directional light of a glTF file.
 
@@ -655,7 +644,7 @@ class Sun(eqx.Module):
 
     name: str = eqx.field(static=True)
     direction: Float[Array, "3"] = eqx.field(converter=require.floating)
-    irradiance: Float[Array, "3"] = eqx.field(converter=_three, default=1.0)
+    irradiance: Float[Array, "3"] = eqx.field(converter=functools.partial(require.repeated, length=3), default=1.0)
 
     def __check_init__(self):
         """Refuses values that are not finite, and directions of no length."""
@@ -671,11 +660,11 @@ class Sun(eqx.Module):
             raise ValueError(f"the direction of sun {self.name!r} must not be zero, got {self.direction}")
 
 
-def _light(value: Any) -> None:
+def _light(value: object) -> None:
     require.kind("the light", value, Environment, source="jaxprt.load_environment")
 
 
-def _suns(value: Any) -> tuple[Sun, ...]:
+def _suns(value: object) -> tuple[Sun, ...]:
     if not isinstance(value, Sequence) or isinstance(value, str | bytes):
         raise TypeError(f"suns must be a list of suns, got {require.shown(value)}")
     for sun in value:

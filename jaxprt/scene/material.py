@@ -11,9 +11,12 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxprt import require
+from jaxprt.brdf.models import scalar
 from jaxprt.compile import jit, known
 from jaxprt.scene import texture
 from jaxprt.scene.mesh import BLEND, CLEAR, Opacity
+
+Fields = dict[str, Any]  # of a `TexturedMaterial`, by name
 
 _COLORS = "base_color", "emissive", "specular_color", "sheen_color"
 ALPHA_MODES = "opaque", "mask", "blend"
@@ -23,14 +26,9 @@ _OPAQUE: tuple[Any, ...] = 0.0, (0, 0), -1, (1, 1), (1.0, 1.0, 1.0), False
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of Rec. 709
 
 
-def _scalar(value: Any) -> Any:
-    """A number as an array. What is not of numbers is left for the class to refuse."""
-    return require.floating(value, dtype=jnp.result_type(float))
-
-
-def _color(value: Any) -> Any:
+def _color(value: object) -> Any:
     """A number or a color as an array of shape [3]. What is known stays known while JAX traces."""
-    value = _scalar(value)
+    value = scalar(value)
     if not isinstance(value, jax.Array) or value.ndim:
         return value
     if isinstance(value, Tracer):
@@ -166,15 +164,15 @@ class TexturedMaterial(eqx.Module):
     """
 
     base_color: Float[Array, "3"] = eqx.field(converter=_color, default=1.0)
-    metallic: Float[Array, ""] = eqx.field(converter=_scalar, default=1.0)
-    roughness: Float[Array, ""] = eqx.field(converter=_scalar, default=1.0)
+    metallic: Float[Array, ""] = eqx.field(converter=scalar, default=1.0)
+    roughness: Float[Array, ""] = eqx.field(converter=scalar, default=1.0)
     emissive: Float[Array, "3"] = eqx.field(converter=_color, default=0.0)
-    ior: Float[Array, ""] = eqx.field(converter=_scalar, default=1.5)
-    specular: Float[Array, ""] = eqx.field(converter=_scalar, default=1.0)
+    ior: Float[Array, ""] = eqx.field(converter=scalar, default=1.5)
+    specular: Float[Array, ""] = eqx.field(converter=scalar, default=1.0)
     specular_color: Float[Array, "3"] = eqx.field(converter=_color, default=1.0)
-    anisotropy: Float[Array, ""] = eqx.field(converter=_scalar, default=0.0)
-    rotation: Float[Array, ""] = eqx.field(converter=_scalar, default=0.0)
-    normal_scale: Float[Array, ""] = eqx.field(converter=_scalar, default=1.0)
+    anisotropy: Float[Array, ""] = eqx.field(converter=scalar, default=0.0)
+    rotation: Float[Array, ""] = eqx.field(converter=scalar, default=0.0)
+    normal_scale: Float[Array, ""] = eqx.field(converter=scalar, default=1.0)
     base_color_texture: Texture | None = None
     metallic_texture: Texture | None = None
     roughness_texture: Texture | None = None
@@ -183,19 +181,19 @@ class TexturedMaterial(eqx.Module):
     specular_color_texture: Texture | None = None
     anisotropy_texture: Texture | None = None
     normal_texture: Texture | None = None
-    clearcoat: Float[Array, ""] = eqx.field(converter=_scalar, default=0.0)
-    clearcoat_roughness: Float[Array, ""] = eqx.field(converter=_scalar, default=0.0)
-    transmission: Float[Array, ""] = eqx.field(converter=_scalar, default=0.0)
+    clearcoat: Float[Array, ""] = eqx.field(converter=scalar, default=0.0)
+    clearcoat_roughness: Float[Array, ""] = eqx.field(converter=scalar, default=0.0)
+    transmission: Float[Array, ""] = eqx.field(converter=scalar, default=0.0)
     clearcoat_texture: Texture | None = None
     clearcoat_roughness_texture: Texture | None = None
     transmission_texture: Texture | None = None
     sheen_color: Float[Array, "3"] = eqx.field(converter=_color, default=0.0)
-    sheen_roughness: Float[Array, ""] = eqx.field(converter=_scalar, default=0.0)
+    sheen_roughness: Float[Array, ""] = eqx.field(converter=scalar, default=0.0)
     sheen_color_texture: Texture | None = None
     sheen_roughness_texture: Texture | None = None
-    alpha: Float[Array, ""] = eqx.field(converter=_scalar, default=1.0)
+    alpha: Float[Array, ""] = eqx.field(converter=scalar, default=1.0)
     alpha_texture: Texture | None = None
-    alpha_cutoff: Float[Array, ""] = eqx.field(converter=_scalar, default=0.5)
+    alpha_cutoff: Float[Array, ""] = eqx.field(converter=scalar, default=0.5)
     alpha_mode: str = eqx.field(static=True, default="opaque")
     back: str = eqx.field(static=True, default="black")
 
@@ -350,7 +348,7 @@ def opacity_of_parts(parts: Sequence[Any]) -> Opacity | None:
     total = sum(len(part.mesh.position) for part in parts)
     coordinate, factor = np.zeros((total, 2), np.float32), np.ones(total, np.float32)
     layer, rows, texels, first = np.zeros(total, np.int32), [_OPAQUE], [np.ones(1, np.float32)], 0
-    place: dict[Any, int] = {}
+    place: dict[tuple, int] = {}
     for part, glass, through in zip(parts, glasses, clear, strict=True):
         span = slice(first, first + len(part.mesh.position))
         first = span.stop
@@ -394,7 +392,7 @@ def _glass(part: Any) -> _Glass | None:
     return _Glass(share * luminance, color / luminance) if share * luminance > CLEAR else None
 
 
-def _mean(factor: Any, image: Texture | None) -> Float[np.ndarray, " _"]:
+def _mean(factor: Array | np.ndarray | float, image: Texture | None) -> Float[np.ndarray, " _"]:
     value = np.atleast_1d(np.asarray(factor, np.float64))
     return value if image is None else value * np.asarray(image.image, np.float64).mean((0, 1))
 

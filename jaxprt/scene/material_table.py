@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxprt.brdf import BlinnPhong, CookTorrance, MetallicRoughness, sheen
@@ -72,6 +73,7 @@ SMOOTHEST = 1e-3**0.5  # smaller roughness is treated as this one
 # again. Against the mean over the pixel: 1 leaves 5.2, 3.5 and 2.2 % of three textures, this 2.9, 1.5 and 1.0 %. Probes
 # along a footprint are as far apart as the pixel is long.
 SHARPER = 0.64
+Images = Mapping[tuple[int, bool], Array | np.ndarray]  # by the identity of the image, and whether it is a normal map
 _LEVELS = 16  # of a mip map at most: images of up to 32,768 texels along an edge
 _PROBES = 4  # lookups along an elongated footprint
 _SMALL = 1 << 16  # values of all textures up to which padding to coarser sizes is not worth avoiding
@@ -212,8 +214,8 @@ def at_vertices(vertex: Int[np.ndarray, " p"]) -> Points:
 def _evaluate(table: MaterialTable, points: Points) -> MaterialLook:
     values, layers = _values(table, points)
     normal = None
-    if table.frame is not None:
-        normal, variance = _normals(table, points)
+    if table.frame is not None and table.normal_scale is not None:
+        normal, variance = _normals(table, table.frame, table.normal_scale, points)
         values = values._replace(roughness=texture.widen_roughness(values.roughness, variance))
         layers = layers and layers._replace(
             clearcoat_roughness=texture.widen_roughness(layers.clearcoat_roughness, variance)
@@ -281,12 +283,15 @@ def _values(table: MaterialTable, points: Points) -> tuple[Values, Layers | None
     return values, layers
 
 
-def _normals(table: MaterialTable, points: Points) -> tuple[Float[Array, "p 3"], Float[Array, " p"]]:
+def _normals(
+    table: MaterialTable,
+    frame: Float[Array | np.ndarray, "v 7"],
+    scale: Float[Array | np.ndarray, " m"],
+    points: Points,
+) -> tuple[Float[Array, "p 3"], Float[Array, " p"]]:
     """Shading normals at points, and the variance of the normals that a pixel averages; see `normal_maps`."""
-    assert table.frame is not None
-    assert table.normal_scale is not None
-    part, base = table.part[points.corner[0]], points.carry(table.frame)
-    has, scale = table.image[part, _NORMAL] >= 0, table.normal_scale[part]
+    part, base = table.part[points.corner[0]], points.carry(frame)
+    has, scale = table.image[part, _NORMAL] >= 0, scale[part]
     frame = directions.frame(directions.normalize(base[:, :3]), base[:, 3:6])
     coordinate, slope = _coordinates(table, points)
     place = coordinate, slope
@@ -301,9 +306,7 @@ def _normals(table: MaterialTable, points: Points) -> tuple[Float[Array, "p 3"],
 
 def _coordinates(table: MaterialTable, points: Points) -> tuple[Float[Array, "p 4"], Float[Array, "2 p 4"]]:
     """Both sets of texture coordinates at points, and their change from pixel to pixel."""
-    place = points.carry(table.coordinate)
-    still = points.slope is None
-    return place, jnp.zeros((2, *place.shape), place.dtype) if still else points.slopes(table.coordinate)
+    return points.carry(table.coordinate), points.slopes(table.coordinate)
 
 
 def _in_image(
@@ -418,7 +421,7 @@ def of_parts(parts: Sequence[Part]) -> MaterialTable:
     count = [len(part.mesh.position) for part in parts]
     dtype, room = jnp.result_type(float), shared_size(sum(count)) - sum(count)
 
-    def column(values: Sequence[Any], otherwise: float, width: int) -> Any:
+    def column(values, otherwise, width):
         pairs = zip(count, values, strict=True)
         rows = [np.full((n, width), otherwise, dtype) if value is None else value for n, value in pairs]
         return _concatenate([*rows, np.full((room, width), otherwise, dtype)], dtype)
@@ -439,7 +442,7 @@ def of_parts(parts: Sequence[Part]) -> MaterialTable:
     return MaterialTable(**_rows(materials, dtype, layered=layered, tilted="frame" in held), **held)
 
 
-def _has_map(material: Any) -> bool:
+def _has_map(material: object) -> bool:
     return isinstance(material, TexturedMaterial) and material.normal_texture is not None
 
 
@@ -471,14 +474,14 @@ def with_materials(
     return MaterialTable(**rows, **held)
 
 
-def has_layers(material: Any) -> bool:
+def has_layers(material: object) -> bool:
     """Whether a material has a clear coat or a sheen or lets light pass. Values that JAX traces may be anything."""
     if not isinstance(material, TexturedMaterial):
         return False
     return any(may_be(factor) for factor in (material.clearcoat, material.transmission, material.sheen_color))
 
 
-def may_be(value: Any) -> bool:
+def may_be(value: object) -> bool:
     """Whether a factor is not 0; true for one that JAX traces."""
     return isinstance(value, Tracer) or bool(np.any(np.asarray(value) != 0))
 
@@ -488,7 +491,7 @@ def _key(name: str, source: Texture) -> tuple[int, bool]:
     return id(source.image), name == TEXTURES[_NORMAL]
 
 
-def _images(materials: Sequence[TexturedMaterial | Callable]) -> dict[tuple[int, bool], Any]:
+def _images(materials: Sequence[TexturedMaterial | Callable]) -> Images:
     """The images of the textures of some materials, each once."""
     names = (*TEXTURES, *LAYER_TEXTURES)
     pairs = [(name, getattr(material, name, None)) for material in materials for name in names]
@@ -497,13 +500,13 @@ def _images(materials: Sequence[TexturedMaterial | Callable]) -> dict[tuple[int,
 
 def _rows(
     materials: Sequence[TexturedMaterial | Callable],
-    dtype: Any,
+    dtype: DTypeLike,
     *,
     layered: bool,
     tilted: bool,
-    old: Mapping[tuple[int, bool], Any] | None = None,
+    old: Images | None = None,
     texels: Texels | None = None,
-) -> dict[str, Any]:
+) -> dict[str, Array | np.ndarray | Texels]:
     """Factors, textures and images of some materials, padded to a number of materials that scenes share."""
     rows, images = shared_size(len(materials)), _images(materials)
     # `texels` holds the images `old` already, and serves again if there are no others.
@@ -513,7 +516,7 @@ def _rows(
         images = old
     names = (*TEXTURES, *LAYER_TEXTURES) if layered else TEXTURES
     number, image = {key: n for n, key in enumerate(images)}, np.full((rows, len(names)), -1, np.int32)
-    transform: Any = np.zeros((*image.shape, 2, 3), dtype)
+    transform: Array | np.ndarray = np.zeros((*image.shape, 2, 3), dtype)
     sets, wrap = np.zeros(image.shape, np.int32), np.zeros((*image.shape, 2), np.int32)
     for row, material in enumerate(materials):
         for column, name in enumerate(names):
@@ -533,7 +536,7 @@ def _rows(
     return {"factor": _concatenate([factor, padding], dtype), **columns}
 
 
-def _set_at(array: Any, place: tuple[int, int], value: Any) -> Any:
+def _set_at(array: Array | np.ndarray, place: tuple[int, int], value: Array | np.ndarray) -> Array | np.ndarray:
     """The array with another value at a place."""
     if isinstance(value, Tracer) or isinstance(array, Tracer):
         return jnp.asarray(array).at[place].set(value)
@@ -542,7 +545,7 @@ def _set_at(array: Any, place: tuple[int, int], value: Any) -> Any:
     return array
 
 
-def _factors(material: TexturedMaterial | Callable, layered: bool) -> Any:
+def _factors(material: TexturedMaterial | Callable, layered: bool) -> Array | np.ndarray:
     """The factors of a material as one row: `_FACTORS`, the kind of model, its F0, and those of layers."""
     textured = material if isinstance(material, TexturedMaterial) else TexturedMaterial()
     xp = np if known(material, textured) else jnp  # a material that is made while JAX traces has traced factors
@@ -559,11 +562,11 @@ def _factors(material: TexturedMaterial | Callable, layered: bool) -> Any:
     return xp.hstack([*(xp.broadcast_to(factor[name], (width,)) for name, width in _FACTORS), model, *f0, *layers])
 
 
-def _concatenate(rows: Sequence[Any], dtype: Any) -> Any:
+def _concatenate(rows: Sequence[Array | np.ndarray], dtype: DTypeLike) -> Array | np.ndarray:
     return jnp.concatenate(rows).astype(dtype) if not known(rows) else np.concatenate(rows).astype(dtype)
 
 
-def _texels(images: Mapping[tuple[int, bool], Any], dtype: Any, least: Texels | None = None) -> Texels:
+def _texels(images: Images, dtype: DTypeLike, least: Texels | None = None) -> Texels:
     """The mip maps of some images in one array, padded to a size that scenes share, or to that of other texels."""
     rows, room = (1, 4) if least is None else (len(least.shape), len(least.value))
     rows = max(shared_size(len(images)), rows)

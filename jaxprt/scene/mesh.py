@@ -72,7 +72,7 @@ class Opacity(eqx.Module):
         return bool(np.any(np.asarray(self.cutoff) == BLEND))
 
 
-def _as_array(value: Any) -> Any:
+def _as_array(value: object) -> Any:
     """NumPy arrays and lists of real numbers as JAX arrays, in float32 and int32 unless float64 is enabled."""
     if isinstance(value, jax.Array) or not isinstance(value, np.ndarray | list | tuple):
         return value
@@ -84,7 +84,7 @@ def _as_array(value: Any) -> Any:
     return jax.device_put(known.astype(np.int32)) if np.all(np.abs(known) < 2**31) else value
 
 
-def _check_shapes(mesh: Any) -> None:
+def _check_shapes(mesh: "Mesh") -> None:
     """Refuses a mesh whose arrays have other types than its fields, or other lengths than its positions."""
     origin = mesh.origin
     if (
@@ -115,14 +115,14 @@ def _check_shapes(mesh: Any) -> None:
             raise ValueError(f"{name} of a mesh must be [{required}], got {list(shape)}")
 
 
-def check_mesh(value: Any) -> None:
+def check_mesh(value: object) -> None:
     """Refuses anything but a mesh."""
     if not all(hasattr(value, field) for field in _FIELDS):
         source = "jaxprt.scene.mesh.make_mesh or jaxprt.load_mesh"
         raise TypeError(f"the mesh must be of class Mesh, which {source} makes, got {require.shown(value)}")
 
 
-def _check_meshes(value: Any) -> None:
+def _check_meshes(value: object) -> None:
     """Refuses anything but a list of meshes, by TypeError."""
     if not isinstance(value, list | tuple):
         raise TypeError(f"meshes must be a list of meshes, got {require.shown(value)}")

@@ -97,7 +97,7 @@ def local(name: str, position: Any, origin: Origin) -> Any:
     return jnp.asarray(np.asarray(position, np.float64) - np.asarray(origin), jnp.result_type(float))
 
 
-def coordinates(value: Any) -> Any:
+def coordinates(value: object) -> Any:
     """Real numbers as an array: of NumPy in float64 where float32 would round large coordinates, otherwise of JAX.
 
     Anything but real numbers is returned unchanged, for the check of the class to refuse.

@@ -229,14 +229,12 @@ def _coarser(image: np.ndarray, axis: int, edge: np.ndarray) -> np.ndarray:
     # `edge` is where pixels begin and end along the axis, in a coordinate in which areas are equal.
     new = np.interp(place, np.arange(count + 1), edge)
     first = np.floor(place[:-1]).astype(int)
-    result: np.ndarray | None = None
+    result = np.zeros((*image.shape[:axis], fewer, *image.shape[axis + 1 :]), image.dtype)
     for step in range(2 if count % 2 == 0 else 3):
         low, high = np.minimum(first + step, count), np.minimum(first + step + 1, count)
         overlap = np.minimum(edge[high], new[1:]) - np.maximum(edge[low], new[:-1])
         share = np.maximum(overlap, 0) / np.diff(new)
         shape = [1] * image.ndim
         shape[axis] = fewer
-        part = np.take(image, np.minimum(low, count - 1), axis) * share.reshape(shape).astype(image.dtype)
-        result = part if result is None else np.add(result, part, out=result)
-    assert result is not None
+        result += np.take(image, np.minimum(low, count - 1), axis) * share.reshape(shape).astype(image.dtype)
     return result

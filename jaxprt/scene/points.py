@@ -54,8 +54,9 @@ class Points(eqx.Module):
         return jnp.asarray(attribute) if self.all_vertices else _carry(self.corner, self.weight, attribute, axis=axis)
 
     def slopes(self, attribute: Float[Array | np.ndarray, "v c"]) -> Float[Array, "2 p c"]:
-        """Change of a vertex attribute from one pixel to the next, to the right and down."""
-        assert self.slope is not None
+        """Change of a vertex attribute from one pixel to the next, to the right and down; zero without `slope`."""
+        if self.slope is None:
+            return jnp.zeros((2, len(self), attribute.shape[1]), attribute.dtype)
         return jnp.stack([Points(self.corner, slope).carry(attribute) for slope in self.slope])
 
     def tilted(self, normal: Float[Array | np.ndarray, "p 3"] | None) -> "Points":

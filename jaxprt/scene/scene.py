@@ -3,6 +3,7 @@
 import collections
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -93,11 +94,11 @@ class Part(eqx.Module):
 
     def surface(self) -> MaterialValues:
         """Material parameters at the vertices."""
-        require.kind(f"the material of part {self.name!r}", self.material, TexturedMaterial, source="jaxprt.load_scene")
-        assert isinstance(self.material, TexturedMaterial)
+        name = f"the material of part {self.name!r}"
+        material = require.kind(name, self.material, TexturedMaterial, source="jaxprt.load_scene")
         place = self.mesh.texture
         place = jnp.zeros((len(self.mesh.position), 2), self.mesh.position.dtype) if place is None else place
-        return self.material.at(place, self.second, color=self.color, handedness=self.handedness)
+        return material.at(place, self.second, color=self.color, handedness=self.handedness)
 
 
 def _place(value: Any) -> Any:
@@ -105,12 +106,6 @@ def _place(value: Any) -> Any:
     value = origins.coordinates(value)
     if isinstance(value, np.ndarray) and value.ndim == 0:  # in float64, where float32 would round it
         return np.broadcast_to(value, (3,))
-    return jnp.broadcast_to(value, (3,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
-
-
-def _three(value: Any) -> Any:
-    """A number or three numbers as an array of shape [3]. What is not of numbers is left for the class to refuse."""
-    value = require.floating(value, dtype=jnp.result_type(float))
     return jnp.broadcast_to(value, (3,)) if isinstance(value, jax.Array) and value.ndim == 0 else value
 
 
@@ -139,7 +134,7 @@ class PointLight(eqx.Module):
 
     name: str = eqx.field(static=True)
     position: Float[Array | np.ndarray, "3"] = eqx.field(converter=_place)
-    intensity: Float[Array, "3"] = eqx.field(converter=_three, default=1.0)
+    intensity: Float[Array, "3"] = eqx.field(converter=partial(require.repeated, length=3), default=1.0)
     axis: Float[Array, "3"] | None = eqx.field(converter=_axis, default=None)
     cone: tuple[float, float] = eqx.field(static=True, default=(0.0, np.pi / 4))
 
@@ -177,7 +172,7 @@ class PointLight(eqx.Module):
         return np.clip((cosine - outer) / max(inner - outer, _EDGE), 0, 1) ** 2
 
 
-def _tuple(items: Any) -> tuple:
+def _tuple(items: object) -> tuple:
     """A sequence as a tuple."""
     if isinstance(items, eqx.Module | str | bytes) or not isinstance(items, Iterable):
         lists = "parts, cameras, environments, point_lights and suns"
@@ -185,7 +180,7 @@ def _tuple(items: Any) -> tuple:
     return tuple(items)
 
 
-def _align_parts(parts: Any) -> tuple:
+def _align_parts(parts: object) -> tuple:
     """Parts whose meshes have one origin. Values that are not parts pass; the scene refuses them."""
     parts = _tuple(parts)
     if not all(isinstance(part, Part) for part in parts):

@@ -42,11 +42,13 @@ def with_copies(scene: Scene) -> tuple[Scene, tuple[Int[np.ndarray, " _"], ...]]
         scene: The scene.
     """
     none = np.zeros(0, np.int64)
-    lit = [isinstance(part.material, TexturedMaterial) and part.material.back == "lit" for part in scene.parts]
+    materials = (part.material for part in scene.parts)
+    lit = [value if isinstance(value, TexturedMaterial) and value.back == "lit" else None for value in materials]
     if not any(lit):
         return scene, (none,) * len(lit)
-    rows = zip(scene.parts, _visible_backs(centered(scene)), lit, strict=True)
-    parts, copied = zip(*(_double(part, face) if wanted else (part, none) for part, face, wanted in rows), strict=True)
+    rows = zip(scene.parts, lit, _visible_backs(centered(scene)), strict=True)
+    pairs = (_double(part, material, face) if material else (part, none) for part, material, face in rows)
+    parts, copied = zip(*pairs, strict=True)
     return dataclasses.replace(scene, parts=list(parts)), copied
 
 
@@ -129,10 +131,11 @@ def _has_twin(corner: Int[np.ndarray, "f 3"]) -> Bool[np.ndarray, " f"]:
     return sides[number.reshape(-1), 1 - odd.astype(int)]
 
 
-def _double(part: Part, copied: Bool[np.ndarray, " f"]) -> tuple[Part, Int[np.ndarray, " _"]]:
+def _double(
+    part: Part, material: TexturedMaterial, copied: Bool[np.ndarray, " f"]
+) -> tuple[Part, Int[np.ndarray, " _"]]:
     """The part with reversed copies of some faces, and the vertices that were copied."""
-    assert isinstance(part.material, TexturedMaterial)
-    material = dataclasses.replace(part.material, back="hidden")
+    material = dataclasses.replace(material, back="hidden")
     mesh, count = part.mesh, len(part.mesh.position)
     vertex, corner = np.unique(np.asarray(mesh.face)[copied], return_inverse=True)
     if not len(vertex):

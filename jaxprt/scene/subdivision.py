@@ -7,7 +7,7 @@ in the surface.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 from jax.typing import ArrayLike
-from jaxtyping import Bool, Float, Int, Integer
+from jaxtyping import Array, Bool, Float, Int, Integer
 
 from jaxprt import require
 from jaxprt.brdf.varying import PerVertex
@@ -347,7 +347,7 @@ def _subdivide_part(part: Part, parents: Sequence[np.ndarray], face: np.ndarray)
     return Part(part.name, _subdivide_mesh(part.mesh, parents, face), part.material, color, second, handedness, alpha)
 
 
-def spread(value: Any, parents: Sequence[np.ndarray]) -> Any:
+def spread(value: Array | np.ndarray, parents: Sequence[np.ndarray]) -> Array | np.ndarray:
     """Values of all vertices, given those before division. Added vertices get the mean of their two parents."""
     xp = np if known(value) else jnp
     value = xp.asarray(value)

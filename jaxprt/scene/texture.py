@@ -27,19 +27,19 @@ _LOWEST = 0.1  # least ratio of a normal's height to its slope: lower normals ar
 _FLAT = 1e-3  # Below this, slopes may be rounding errors: a normal without height is then that of the surface.
 
 
-def mipmap(image: Float[Array | np.ndarray, "h w c"]) -> list[Any]:
+def mipmap(image: Float[Array | np.ndarray, "h w c"]) -> list[Array | np.ndarray]:
     """The levels of an image's mip map, finest first; in NumPy unless JAX traces the image.
 
     Each level averages the level before over texels of twice the edge. Odd sizes are halved and rounded up. Texels at
     the border are then weighted by the area that they cover.
     """
-    result: list[Any] = [image if isinstance(image, Tracer) else np.asarray(image)]
+    result: list[Array | np.ndarray] = [image if isinstance(image, Tracer) else np.asarray(image)]
     while max(result[-1].shape[:2]) > 1:
         result.append(_halve(_halve(result[-1], 0), 1))
     return result
 
 
-def _halve(image: Any, axis: int) -> Any:
+def _halve(image: Array | np.ndarray, axis: int) -> Array | np.ndarray:
     size = image.shape[axis]
     count = -(-size // 2)
     if size == 2 * count:

@@ -43,7 +43,7 @@ def pad(value: Value, size: int | None) -> Value:  # pyright: ignore[reportInval
     if size is None:
         return value
 
-    def longer(axes: list[str], leaf: Any) -> Any:
+    def longer(axes, leaf):
         if "v" not in axes:
             return leaf
         after = [size - length if name == "v" else 0 for name, length in zip(axes, leaf.shape, strict=True)]

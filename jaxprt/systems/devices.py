@@ -111,7 +111,7 @@ def _mesh(devices: Any) -> jax.sharding.Mesh:
     return jax.sharding.Mesh(np.array(row), ("vertex",))
 
 
-def _even(value: Any, shares: int) -> Any:
+def _even(value: PyTree, shares: int) -> PyTree:
     """The system, padded if its number of vertices is not divisible by the number of shares."""
     if not isinstance(value, VertexSystem):
         return value
@@ -123,7 +123,7 @@ def _even(value: Any, shares: int) -> Any:
 def _pad(value: Value, count: int, size: int) -> Value:
     """Pads the arrays of `count` vertices to `size` by repeating the last vertex."""
 
-    def longer(axes: list[str], leaf: Any) -> Any:
+    def longer(axes, leaf):
         for name, before, after in (("v", count, size), ("block", -(-count // BLOCK), -(-size // BLOCK))):
             if name in axes and leaf.shape[axes.index(name)] == before:
                 return jnp.pad(leaf, [(0, after - before if axis == name else 0) for axis in axes], mode="edge")

@@ -57,7 +57,7 @@ def take(value: Piece, start: int, stop: int) -> Piece:
     return map_leaves(value, lambda axes, leaf: _cut(axes, leaf, start, stop))
 
 
-def _kind(value: Any) -> str:
+def _kind(value: object) -> str:
     return type(value).__name__
 
 

@@ -4,8 +4,7 @@ Exported pages hold it, and viewers that run Python send it to their page once.
 """
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Hashable, Sequence
 
 import jax
 import numpy as np
@@ -13,6 +12,7 @@ from jaxtyping import Float, Int8
 
 from jaxprt.brdf import GGX, BlinnPhong, CookTorrance
 from jaxprt.brdf.varying import Channels
+from jaxprt.files.inputs import JsonObject
 from jaxprt.relit.channels import Shading
 from jaxprt.scene import Environment, Part, TexturedMaterial, material_table
 from jaxprt.scene.material import Texture
@@ -35,7 +35,7 @@ _COLORED = ("base_color", "emissive")  # of these, those that are encoded by sRG
 _SKY = 64  # most texels along the edge of a light's faces
 
 
-def page_content(page: PageScene, lights: Sequence[Environment]) -> tuple[dict[str, Any], list[bytes]]:
+def page_content(page: PageScene, lights: Sequence[Environment]) -> tuple[JsonObject, list[bytes]]:
     """JSON description and arrays of a scene and its lights, without positions and faces.
 
     `Piece` in the page's module defines the order of the arrays: those of `scene_content`, borders of cubemaps, and
@@ -52,7 +52,7 @@ def page_content(page: PageScene, lights: Sequence[Environment]) -> tuple[dict[s
 
 def unshadowed_content(
     parts: Sequence[Part], shadings: Sequence[Shading], lights: Sequence[Environment]
-) -> tuple[dict[str, Any], list[bytes]]:
+) -> tuple[JsonObject, list[bytes]]:
     """`page_content` of a scene of which no visibility is known: the page shows it without shadows.
 
     Args:
@@ -65,7 +65,7 @@ def unshadowed_content(
     return page_content(page, lights)
 
 
-def scene_content(page: PageScene) -> tuple[dict[str, Any], list[bytes]]:
+def scene_content(page: PageScene) -> tuple[JsonObject, list[bytes]]:
     """JSON description and arrays of all parts. `Piece` in the page's module defines their order."""
     bits = page.bits or [np.zeros((0, 0), np.uint8)] * len(page.parts)
     unit, visible_unit = unit_of([held.vector for held in page.parts]), unit_of([held.visible for held in page.parts])
@@ -117,7 +117,7 @@ def scene_content(page: PageScene) -> tuple[dict[str, Any], list[bytes]]:
     return content | added, [array.tobytes() for array in (*joined, reflected)]
 
 
-def _reflected(page: PageScene) -> tuple[dict[str, Any], Int8[np.ndarray, " n"]]:
+def _reflected(page: PageScene) -> tuple[JsonObject, Int8[np.ndarray, " n"]]:
     """What bounces and lamps add at each vertex: units of the rows, and for each row three colors in a word."""
     if page.reflected is None:
         return {"reflectedUnit": []}, np.zeros(0, np.int8)
@@ -144,7 +144,7 @@ class _Tables:
 
     def __init__(self):
         """Starts without tables."""
-        self._made: dict[Any, tuple[int, Float[np.ndarray, "h q e 4"]]] = {}
+        self._made: dict[Hashable, tuple[int, Float[np.ndarray, "h q e 4"]]] = {}
         self._end = 0
 
     def add(self, what: str, held: Exported) -> tuple[int, Float[np.ndarray, "h q e 4"]]:
@@ -171,7 +171,7 @@ class _Images:
         self.data: list[np.ndarray] = []  # first row on top; colors are encoded by sRGB
         self._number: dict[tuple[int, str], int] = {}
 
-    def add(self, texture: Texture, name: str) -> dict[str, Any]:
+    def add(self, texture: Texture, name: str) -> JsonObject:
         """How a texture reads its image, which is added where it is new."""
         colored, normal = name in _COLORED, name == "normal"
         key = id(texture.image), "color" if colored else "normal" if normal else "value"
@@ -199,7 +199,7 @@ def _bytes(value: Float[np.ndarray, "k v"], unit: Float[np.ndarray, " m"], lengt
     return padded
 
 
-def _scales(page: PageScene) -> dict[str, Any]:
+def _scales(page: PageScene) -> JsonObject:
     """The scales of visibility that the page keeps."""
     scale, level = page.scales, page.level
     if scale is None:
@@ -218,7 +218,7 @@ def mip_edges(size: int) -> list[int]:
     return result
 
 
-def blur_parameters(size: int) -> dict[str, Any]:
+def blur_parameters(size: int) -> JsonObject:
     """Parameters for blurring the light to all lobe widths, as `jaxprt.systems.lobe.blurred_light.prefilter` does."""
     scale = blurred_light.scales(size)
     pairs = zip(scale.edge.tolist(), scale.spread.tolist(), strict=True)
@@ -260,12 +260,12 @@ def _weights(shading: Shading, held: Exported) -> Float[np.ndarray, "v k 4"]:
     return result
 
 
-def _colors(material: Any, *names: str) -> dict[str, list[float]]:
+def _colors(material: object, *names: str) -> dict[str, list[float]]:
     """Parameters of a material in three colors."""
     return {name: np.broadcast_to(np.asarray(getattr(material, name), float), 3).tolist() for name in names}
 
 
-def _material_json(part: Part, shading: Shading, images: _Images) -> dict[str, Any] | None:
+def _material_json(part: Part, shading: Shading, images: _Images) -> JsonObject | None:
     """Parameters of a material without attributes of vertices, with its textures; None for other materials."""
     material = part.material
     if isinstance(material, BlinnPhong) and shading.table == standard.BLINN_PHONG:
@@ -275,7 +275,7 @@ def _material_json(part: Part, shading: Shading, images: _Images) -> dict[str, A
     if not isinstance(material, TexturedMaterial) or shading.scale is None or part.color is not None:
         return None
     names = ("base_color", "metallic", "specular", "specular_color", "ior", "roughness", "emissive", "normal_scale")
-    values: dict[str, Any] = {name: np.asarray(getattr(material, name), float).tolist() for name in names}
+    values: JsonObject = {name: np.asarray(getattr(material, name), float).tolist() for name in names}
     fields = {
         field.name.removesuffix("_texture"): getattr(material, field.name) for field in dataclasses.fields(material)
     }

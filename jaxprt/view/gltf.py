@@ -16,6 +16,7 @@ from jaxprt import require
 from jaxprt.brdf import BlinnPhong, CookTorrance
 from jaxprt.compile import put
 from jaxprt.files import outputs, write_png
+from jaxprt.files.inputs import JsonObject
 from jaxprt.image.tonemap import encode_srgb
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.scene import RelitScene
@@ -42,11 +43,11 @@ class _File:
     def __init__(self):
         """Starts an empty file."""
         self.data = bytearray()
-        self.objects: dict[str, list[dict[str, Any]]] = {}
+        self.objects: dict[str, list[JsonObject]] = {}
         self.extensions: set[str] = set()
         self._textures: dict[tuple, int] = {}
 
-    def add(self, kind: str, value: dict[str, Any]) -> int:
+    def add(self, kind: str, value: JsonObject) -> int:
         """Adds an object and returns its index."""
         self.objects.setdefault(kind, []).append(value)
         return len(self.objects[kind]) - 1
@@ -82,11 +83,11 @@ class _File:
             self._textures[key] = self.add("textures", {"source": source, "sampler": self.add("samplers", sampler)})
         return self._textures[key]
 
-    def content(self, asset: dict[str, Any], scene: str) -> bytes:
+    def content(self, asset: JsonObject, scene: str) -> bytes:
         """The complete file, whose scene has all nodes."""
         self.data += bytes(-len(self.data) % 4)
         nodes = list(range(len(self.objects["nodes"])))
-        head: dict[str, Any] = {"asset": {"version": "2.0", "generator": "jaxprt", "extras": asset}, "scene": 0}
+        head: JsonObject = {"asset": {"version": "2.0", "generator": "jaxprt", "extras": asset}, "scene": 0}
         if self.extensions:
             head["extensionsUsed"] = sorted(self.extensions)
         head |= {"scenes": [{"name": scene, "nodes": nodes}], **self.objects}
@@ -200,7 +201,7 @@ def _add_node(file: _File, part: Part, name: str, attributes: dict[str, int], ma
     file.add("nodes", {"name": name, "mesh": file.add("meshes", {"name": name, "primitives": [primitive]}), **place})
 
 
-def _material(file: _File, part: Part, shading: Shading) -> dict[str, Any]:
+def _material(file: _File, part: Part, shading: Shading) -> JsonObject:
     """The material of a part. `coordinates` has the attributes that its textures need."""
     material = part.material
     if not isinstance(material, TexturedMaterial):
@@ -209,12 +210,12 @@ def _material(file: _File, part: Part, shading: Shading) -> dict[str, Any]:
         return {"pbrMetallicRoughness": factors, "coordinates": {}}
     factor = {name: np.asarray(getattr(material, name), float) for name in ("base_color", "metallic", "roughness")}
     opaque = material.alpha_mode == "opaque"
-    pbr: dict[str, Any] = {
+    pbr: JsonObject = {
         "baseColorFactor": [*factor["base_color"].tolist(), 1.0 if opaque else float(material.alpha)],
         "metallicFactor": float(factor["metallic"]),
         "roughnessFactor": float(factor["roughness"]),
     }
-    result: dict[str, Any] = {"pbrMetallicRoughness": pbr, "doubleSided": material.back == "lit"}
+    result: JsonObject = {"pbrMetallicRoughness": pbr, "doubleSided": material.back == "lit"}
     if not opaque:
         result["alphaMode"] = material.alpha_mode.upper()
     if material.alpha_mode == "mask":
@@ -225,7 +226,7 @@ def _material(file: _File, part: Part, shading: Shading) -> dict[str, Any]:
     return result
 
 
-def _plain(material: Any, shading: Shading) -> tuple[list[float], float]:
+def _plain(material: object, shading: Shading) -> tuple[list[float], float]:
     """Diffuse color and roughness of a BRDF that glTF does not have: gray for one that has no diffuse color."""
     if isinstance(material, BlinnPhong):
         roughness = float((2 / (float(material.exponent) + 2)) ** 0.25)
@@ -237,7 +238,7 @@ def _plain(material: Any, shading: Shading) -> tuple[list[float], float]:
     return np.clip(np.broadcast_to(albedo, 3), 0, 1).tolist(), 1.0
 
 
-def _add_emission(file: _File, material: TexturedMaterial, result: dict[str, Any]) -> None:
+def _add_emission(file: _File, material: TexturedMaterial, result: JsonObject) -> None:
     emissive = np.asarray(material.emissive, float)
     strength = max(float(emissive.max()), 1.0)
     if emissive.any():
@@ -247,7 +248,7 @@ def _add_emission(file: _File, material: TexturedMaterial, result: dict[str, Any
         result.setdefault("extensions", {})["KHR_materials_emissive_strength"] = {"emissiveStrength": strength}
 
 
-def _add_reflectance(file: _File, material: TexturedMaterial, result: dict[str, Any]) -> None:
+def _add_reflectance(file: _File, material: TexturedMaterial, result: JsonObject) -> None:
     color, weight = np.asarray(material.specular_color, float), float(material.specular)
     if weight != 1 or np.any(color != 1):
         file.extensions.add("KHR_materials_specular")
@@ -258,7 +259,7 @@ def _add_reflectance(file: _File, material: TexturedMaterial, result: dict[str, 
         result.setdefault("extensions", {})["KHR_materials_ior"] = {"ior": float(material.ior)}
 
 
-def _add_textures(file: _File, part: Part, material: TexturedMaterial, result: dict[str, Any]) -> None:
+def _add_textures(file: _File, part: Part, material: TexturedMaterial, result: JsonObject) -> None:
     """Adds the textures of base color, metal, roughness, normals and emission, with coordinates for each transform."""
     attributes: dict[str, int] = {}
     numbers: dict[tuple, int] = {}

@@ -12,7 +12,11 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxprt import require
+from jaxprt.files.inputs import JsonObject
 from jaxprt.image.tonemap import apply_curve
+
+Changes = tuple[tuple[str, Any], ...]  # names of parameters of a material, and their values
+Message = Mapping[str, Any]  # of the browser: the object that its JSON holds
 
 MOST_BYTES = 1 << 29  # largest message, such as one with an environment map
 _MOST_JSON = 1 << 24  # bytes of the JSON of a message; it takes many times its size in memory
@@ -24,7 +28,7 @@ _LARGEST_HALF = 65504.0
 class Reply(NamedTuple):
     """An answer: its JSON content, and arrays as bytes."""
 
-    content: dict[str, Any]
+    content: JsonObject
     buffers: list[bytes]
 
 
@@ -65,7 +69,7 @@ class Look(NamedTuple):
     target: tuple[float, ...]
     field_of_view: float
     bounces: bool
-    material: tuple[tuple[str, tuple[tuple[str, Any], ...]], ...]
+    material: tuple[tuple[str, Changes], ...]
 
 
 # Material parameters that can change: their number of values and largest value.
@@ -79,7 +83,7 @@ MATERIAL = {
 }
 
 
-def look(message: Mapping[str, Any], *, systems: Sequence[str], lights: int) -> Look:
+def look(message: Message, *, systems: Sequence[str], lights: int) -> Look:
     """Parses the look that a message requests.
 
     Raises:
@@ -105,7 +109,7 @@ def look(message: Mapping[str, Any], *, systems: Sequence[str], lights: int) -> 
     )
 
 
-def system(message: Mapping[str, Any], systems: Sequence[str]) -> str:
+def system(message: Message, systems: Sequence[str]) -> str:
     """The name of the system that a message requests."""
     name = message.get("system")
     if not isinstance(name, str) or name not in systems:
@@ -113,7 +117,7 @@ def system(message: Mapping[str, Any], systems: Sequence[str]) -> str:
     return name
 
 
-def number(message: Mapping[str, Any], name: str, low: float, high: float) -> float:
+def number(message: Message, name: str, low: float, high: float) -> float:
     """Reads a finite number from a message."""
     value = message.get(name)
     large = isinstance(value, int) and abs(value) >= _LARGEST_INTEGER  # float() would raise OverflowError
@@ -124,7 +128,7 @@ def number(message: Mapping[str, Any], name: str, low: float, high: float) -> fl
     return float(value)
 
 
-def truth(message: Mapping[str, Any], name: str) -> bool:
+def truth(message: Message, name: str) -> bool:
     """Reads a field that is true or false; false if it is missing."""
     value = message.get(name, False)
     if not isinstance(value, bool):
@@ -132,7 +136,7 @@ def truth(message: Mapping[str, Any], name: str) -> bool:
     return value
 
 
-def text(message: Mapping[str, Any], name: str) -> str:
+def text(message: Message, name: str) -> str:
     """Reads a field that is text; empty if it is missing.
 
     Raises:
@@ -144,7 +148,7 @@ def text(message: Mapping[str, Any], name: str) -> str:
     return value
 
 
-def _shorten(value: Any) -> str:
+def _shorten(value: object) -> str:
     """A value in an error message, cut off where it is long."""
     if isinstance(value, int) and abs(value) >= _LARGEST_INTEGER:
         return f"an integer of {value.bit_length()} bits"
@@ -153,9 +157,7 @@ def _shorten(value: Any) -> str:
     return f"a {type(value).__name__}"
 
 
-def numbers(
-    message: Mapping[str, Any], name: str, count: int, *, low: float = -1e30, high: float = 1e30
-) -> tuple[float, ...]:
+def numbers(message: Message, name: str, count: int, *, low: float = -1e30, high: float = 1e30) -> tuple[float, ...]:
     """Reads a list of `count` finite numbers from a message."""
     value = _items(message, name)
     if len(value) != count:
@@ -163,14 +165,14 @@ def numbers(
     return tuple(number({name: item}, name, low, high) for item in value)
 
 
-def pack(content: Mapping[str, Any], buffers: Sequence[bytes]) -> bytes:
+def pack(content: Message, buffers: Sequence[bytes]) -> bytes:
     """Packs a message and its arrays into bytes: the length of the JSON, the JSON, and the arrays."""
     head = json.dumps({"content": content, "lengths": [len(buffer) for buffer in buffers]}, allow_nan=False).encode()
     head += b" " * (-(len(head) + 4) % 8)  # arrays are aligned to eight bytes
     return b"".join([struct.pack("<I", len(head)), head, *(buffer + bytes(-len(buffer) % 8) for buffer in buffers)])
 
 
-def unpack(data: bytes | bytearray) -> tuple[dict[str, Any], list[bytes]]:
+def unpack(data: bytes | bytearray) -> tuple[JsonObject, list[bytes]]:
     """Unpacks bytes from `pack` into the message and its arrays."""
     try:
         (length,) = struct.unpack_from("<I", data)
@@ -245,21 +247,21 @@ def displayed(color: ArrayLike, *, stops: float, tone: str) -> Float[np.ndarray,
     return np.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * exposed ** (1 / 2.4) - 0.055)
 
 
-def _items(message: Mapping[str, Any], name: str) -> Sequence[Any]:
+def _items(message: Message, name: str) -> Sequence[Any]:
     value = message.get(name, [])
     if not isinstance(value, list | tuple):
         raise ValueError(f"{name} must be a list, got {_shorten(value)}")
     return value
 
 
-def _lamps(message: Mapping[str, Any]) -> tuple[Lamp, ...]:
+def _lamps(message: Message) -> tuple[Lamp, ...]:
     lamps = _items(message, "lamps")
     if len(lamps) > _MOST_LAMPS:
         raise ValueError(f"lamps must be at most {_MOST_LAMPS}, got {len(lamps)}")
     return tuple(_lamp(lamp) for lamp in lamps)
 
 
-def _lamp(message: Any) -> Lamp:
+def _lamp(message: object) -> Lamp:
     if not isinstance(message, Mapping):
         raise ValueError(f"a lamp must have a direction, an angle and a radiance, got {_shorten(message)}")
     direction = numbers(message, "direction", 3)
@@ -268,13 +270,13 @@ def _lamp(message: Any) -> Lamp:
     return Lamp(direction, number(message, "angle", 1e-3, math.pi), numbers(message, "radiance", 3, low=0.0, high=1e9))
 
 
-def _materials(message: Any) -> tuple[tuple[str, tuple[tuple[str, Any], ...]], ...]:
+def _materials(message: object) -> tuple[tuple[str, Changes], ...]:
     if not isinstance(message, Mapping):
         raise ValueError(f"materials must be a dictionary from names of parts, got {_shorten(message)}")
     return tuple(sorted((str(name), _material(name, value)) for name, value in message.items()))
 
 
-def _material(part: str, message: Any) -> tuple[tuple[str, Any], ...]:
+def _material(part: str, message: object) -> Changes:
     if not isinstance(message, Mapping) or not set(message) <= set(MATERIAL):
         raise ValueError(
             f"the material of part {_shorten(part)} must be a dictionary with keys among {', '.join(MATERIAL)}, got "

@@ -7,10 +7,11 @@ import pathlib
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from jaxprt import require
 from jaxprt.files import outputs
+from jaxprt.files.inputs import JsonObject
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment
 from jaxprt.view import browser, messages, page_error
@@ -172,24 +173,21 @@ def _sizes(page: PageScene) -> Iterator[tuple[bool, _Size]]:
     lobes = sum(count for count, held in zip(counts, page.parts, strict=True) if held.scales is not None)
     matrices = [(count, held.degree) for count, held in zip(counts, page.parts, strict=True) if held.degree is not None]
     for texels in [True, False] if page.holds_texels else [False]:
-        degree = max((most for _, most in matrices), default=None)
+        degree = max((most for _, most in matrices), default=0)
         level = 0 if scale is None else FIRST
         while True:
-            yield texels, _Size(level, 0 if scale is None else int(scale.edge[level]), degree)
+            yield texels, _Size(level, 0 if scale is None else int(scale.edge[level]), degree if matrices else None)
             means = 0
             # From single texels the page makes averaged visibility, which then takes no bytes.
             if scale is not None and not texels and level < len(scale.edge) - 1:
                 means = lobes * int(scale.total - scale.start[level])
-            bands = 0
-            if degree is not None and degree > 1:
-                bands = sum(count * (2 * min(most, degree) + 1) ** 2 for count, most in matrices)
+            bands = sum(count * (2 * min(most, degree) + 1) ** 2 for count, most in matrices if degree > 1)
             if not means and not bands:
                 break
             # The data that takes more bytes is reduced first.
             if means >= bands:
                 level += 1
             else:
-                assert degree is not None
                 degree -= 1
 
 
@@ -197,7 +195,7 @@ def _page(
     session: Session,
     reduced: PageScene,
     lights: Mapping[str, Environment],
-    contents: tuple[dict[str, Any], list[bytes]],
+    contents: tuple[JsonObject, list[bytes]],
     skies: Sequence[Reply | None] = (),
     *,
     error: float,
@@ -242,7 +240,7 @@ def _skies(session: Session, room: int | float) -> list[Reply | None]:
     return [None] * len(shown)
 
 
-def _free_parameters(free: dict[str, Any]) -> dict[str, Any]:
+def _free_parameters(free: JsonObject) -> JsonObject:
     """What users of the page can change of a part, of what they can change in the viewer."""
     result = dict(free)
     if "roughness" in free:

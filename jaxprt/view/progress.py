@@ -4,7 +4,8 @@ import os
 import sys
 import threading
 from collections.abc import Sequence
-from typing import Any
+
+from jaxprt.files.inputs import JsonObject
 
 COMPILING = "compiling programs for changes"  # the last stage, after which the scene is complete
 _LOWER = 10  # by which the priority of a thread is reduced
@@ -58,7 +59,7 @@ class Progress:
         """Nothing more will be done."""
         self._set("_finished", True)
 
-    def _set(self, name: str, value: Any) -> None:
+    def _set(self, name: str, value: object) -> None:
         with self._changed:
             setattr(self, name, value)
             self._changed.notify_all()
@@ -80,7 +81,7 @@ class Progress:
         """Whether nothing more will be done."""
         return self._finished
 
-    def content(self) -> dict[str, Any]:
+    def content(self) -> JsonObject:
         """The message to the page."""
         with self._changed:
             content = {"kind": "progress", "stage": self._stage, "fraction": self._share, "finished": self._finished}

@@ -10,7 +10,7 @@ import time
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -28,7 +28,7 @@ from jaxprt.scene.mesh import bounds
 from jaxprt.systems import protocol
 from jaxprt.view import messages, stages
 from jaxprt.view.content import light_texels, mip_edges, page_content, unshadowed_content
-from jaxprt.view.messages import Lamp, Look, Reply
+from jaxprt.view.messages import Lamp, Look, Message, Reply
 from jaxprt.view.progress import COMPILING, EndedError, Progress, yield_cores
 from jaxprt.view.reduced import PageScene
 from jaxprt.view.stages import Stages
@@ -148,7 +148,7 @@ class Session:
                 raise ValueError(f"systems must be of the same scene, got another scene for {name!r}")
         lights = environments
         if lights is None and self._version is None:
-            lights = _name_lights(lights_of(scene.scene))
+            lights = {f"light {number}": light for number, light in enumerate(lights_of(scene.scene), 1)}
         if lights is not None:
             _check_lights(lights)
         self._replace(by_name, lights, preview=preview)
@@ -164,7 +164,13 @@ class Session:
         _check_lights(environments)
         self._replace({name: scene}, environments, preview=True)
 
-    def _replace(self, systems: Any, environments: Mapping[str, Environment] | None, *, preview: bool) -> None:
+    def _replace(
+        self,
+        systems: Mapping[str, RelitScene | Unshadowed],
+        environments: Mapping[str, Environment] | None,
+        *,
+        preview: bool,
+    ) -> None:
         new = Stages(systems, environments or {})
         with self._lock:
             old = self._version
@@ -211,9 +217,9 @@ class Session:
         """Abandons what is being computed, because nobody waits for it any more."""
         self._ended = True
 
-    def answer(self, message: Mapping[str, Any], buffers: Sequence[bytes] = ()) -> Reply:
+    def answer(self, message: Message, buffers: Sequence[bytes] = ()) -> Reply:
         """Answers a message of the browser. The answer to an invalid message states the error."""
-        kinds: dict[str, Callable[[Mapping[str, Any], Sequence[bytes]], Reply]] = {
+        kinds: dict[str, Callable[[Message, Sequence[bytes]], Reply]] = {
             "scene": self._scene,
             "look": self._look,
             "still": self._still,
@@ -239,8 +245,7 @@ class Session:
 
     def picture(self) -> Float[np.ndarray, "h w 3"]:
         """The first picture of the viewer, from vertex radiance, encoded for display."""
-        scene = self.stages.scene
-        assert isinstance(scene, RelitScene)
+        scene = stages.relit(self.stages.scene)
         camera = dataclasses.replace(scene.camera, width=_PICTURE[0], height=_PICTURE[1])
         color = scene.radiance(self.stages.lights[0], eye=camera.eye)
         behind = sky(self.stages.lights[0], camera)
@@ -254,14 +259,14 @@ class Session:
         data, scale = messages.encode(np.concatenate([level.reshape(-1, 3) for level in levels]), stops=None)
         return Reply({"kind": "sky", "scale": scale, "width": width, "height": height, "levels": len(levels)}, [data])
 
-    def _progress(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+    def _progress(self, message: Message, buffers: Sequence[bytes]) -> Reply:
         """What is being prepared, and the number of scenes so far. It grows when there is a better scene."""
         # A page says how large its pictures are, so that their programs can be compiled ahead.
         if "width" in message:
             self._size = _size(message)[:2]
         return Reply(self.progress.content() | {"version": self.version}, [])
 
-    def _scene(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+    def _scene(self, message: Message, buffers: Sequence[bytes]) -> Reply:
         if self._version is None:
             return self._progress(message, buffers)
         number, shown, preview = self._version
@@ -294,7 +299,7 @@ class Session:
         arrays = np.asarray(mesh.position, "<f4"), face[np.argsort(hidden, kind="stable")]
         return Reply(content, [array.tobytes() for array in arrays])
 
-    def _page(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+    def _page(self, message: Message, buffers: Sequence[bytes]) -> Reply:
         """What the browser's GPU shades pixels from, or why it cannot."""
         shown = self.stages
         name = messages.system(message, list(shown.systems))
@@ -308,7 +313,7 @@ class Session:
             return Reply({"kind": "page", "system": name, "missing": str(error)}, [])
         return Reply(content | {"kind": "page", "system": name}, arrays)
 
-    def _parse(self, message: Mapping[str, Any]) -> tuple[Stages, Look, int]:
+    def _parse(self, message: Message) -> tuple[Stages, Look, int]:
         """The scene that is shown, the look of a message, and its number. It is late if the page has another scene."""
         shown = self._shown()
         if "version" in message and messages.number(message, "version", 0.0, 2.0**53) != shown.number:
@@ -316,7 +321,7 @@ class Session:
         look = messages.look(message, systems=list(shown.stages.systems), lights=len(shown.stages.lights))
         return shown.stages, look, int(messages.number(message, "seq", 0.0, 2.0**53))
 
-    def _look(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+    def _look(self, message: Message, buffers: Sequence[bytes]) -> Reply:
         shown, look, seq = self._parse(message)
         viewer = _viewer(message)
         with self._lock:
@@ -338,7 +343,7 @@ class Session:
         content = {"kind": "color", "seq": seq, "scale": scale, "ms": times}
         return Reply(content, [data] if which is None else [data, np.packbits(which).tobytes()])
 
-    def _still(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+    def _still(self, message: Message, buffers: Sequence[bytes]) -> Reply:
         shown, look, seq = self._parse(message)
         width, height, coarse = _size(message)
         began, between = time.perf_counter(), self._between(message, seq, shown)
@@ -352,7 +357,7 @@ class Session:
         size = {"width": width, "height": height}
         return Reply({"kind": "still", "seq": seq, "scale": scale, "ms": spent, **size}, [data, *alpha])
 
-    def _exact(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+    def _exact(self, message: Message, buffers: Sequence[bytes]) -> Reply:
         """The exact picture under direct light of the environment, and the relit picture's error at some pixels."""
         shown, look, seq = self._parse(message)
         width, height, coarse = _size(message)
@@ -372,7 +377,7 @@ class Session:
         size, alpha = {"width": truth.camera.width, "height": truth.camera.height}, [_alpha(picture)] if clear else []
         return Reply({"kind": "still", "seq": seq, "scale": scale, "exact": True, **told, **size}, [data, *alpha])
 
-    def _picture(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+    def _picture(self, message: Message, buffers: Sequence[bytes]) -> Reply:
         """A PNG file of a picture of any size. Newer looks do not abandon it."""
         shown, look, _ = self._parse(message)
         width, height = (int(messages.number(message, key, 1.0, _LARGEST_FILE)) for key in ("width", "height"))
@@ -392,14 +397,14 @@ class Session:
         if self._ended:
             raise _LateError
 
-    def _sky(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+    def _sky(self, message: Message, buffers: Sequence[bytes]) -> Reply:
         """Pictures of a light before rotation, each of half as many rows as the one before."""
         _, look, seq = self._parse(message)
         rows = int(messages.number(message, "rows", 1.0, _SKY_ROWS)) if "rows" in message else 1
         reply = self.sky(look.light, look.lamps, rows=rows)
         return Reply(reply.content | {"seq": seq}, reply.buffers)
 
-    def _drop(self, message: Mapping[str, Any], buffers: Sequence[bytes]) -> Reply:
+    def _drop(self, message: Message, buffers: Sequence[bytes]) -> Reply:
         """Adds a light from a file that was dropped on the viewer."""
         # Only a name, because browsers of Windows may send paths too.
         file = pathlib.PurePath(
@@ -424,7 +429,7 @@ class Session:
             content = {"kind": "lights", "lights": list(self.stages.name), "light": len(self.stages.name) - 1}
             return Reply(content, [texels])
 
-    def _between(self, message: Mapping[str, Any], seq: int, shown: Stages) -> Callable[[], None]:
+    def _between(self, message: Message, seq: int, shown: Stages) -> Callable[[], None]:
         """A function to call between the steps of a picture. It raises if there is a newer look or a better scene."""
         viewer = _viewer(message)
 
@@ -447,7 +452,7 @@ def _hidden_faces(scene: RelitScene | Unshadowed) -> Bool[np.ndarray, " f"]:
     return sides.hidden_backs(scene.scene)[np.asarray(scene.mesh.region)[np.asarray(scene.mesh.face)[:, 0]]]
 
 
-def _which(message: Mapping[str, Any], look: Look, shown: Stages) -> Bool[np.ndarray, " v"] | None:
+def _which(message: Message, look: Look, shown: Stages) -> Bool[np.ndarray, " v"] | None:
     """Mask of the vertices that a message requests: those that face the eye, or the others; None for all."""
     asked = message.get("vertices", "all")
     if asked not in ("all", "seen", "unseen"):
@@ -458,12 +463,12 @@ def _which(message: Mapping[str, Any], look: Look, shown: Stages) -> Bool[np.nda
     return seen if asked == "seen" else ~seen
 
 
-def _viewer(message: Mapping[str, Any]) -> str:
+def _viewer(message: Message) -> str:
     """The name that a viewer has chosen. Each viewer numbers its own looks."""
     return messages.text(message, "viewer")[:64]
 
 
-def _size(message: Mapping[str, Any]) -> tuple[int, int, bool]:
+def _size(message: Message) -> tuple[int, int, bool]:
     """Width and height of the picture that a message requests, and whether it is a coarse one, which is smaller."""
     width, height = (int(messages.number(message, key, 1.0, _LARGEST)) for key in ("width", "height"))
     coarse = messages.truth(message, "coarse")
@@ -471,15 +476,11 @@ def _size(message: Mapping[str, Any]) -> tuple[int, int, bool]:
     return max(width // step, 1), max(height // step, 1), coarse
 
 
-def _name_lights(lights: Sequence[Environment]) -> dict[str, Environment]:
-    return {f"light {number}": light for number, light in enumerate(lights, 1)}
-
-
-def _stops(message: Mapping[str, Any]) -> float | None:
+def _stops(message: Message) -> float | None:
     return None if message.get("stops") is None else messages.number(message, "stops", -60.0, 60.0)
 
 
-def _tone(message: Mapping[str, Any]) -> str:
+def _tone(message: Message) -> str:
     tone = message.get("tone", "srgb")
     if tone not in TONES:
         raise ValueError(f"tone must be one of {', '.join(TONES)}, got {str(tone)[:80]!r}")

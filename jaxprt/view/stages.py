@@ -10,16 +10,17 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, UInt32
+from jaxtyping import Array, Bool, Float, PyTree, UInt32
 
 from jaxprt.brdf import BlinnPhong, CookTorrance
 from jaxprt.compile import Between
+from jaxprt.files.inputs import JsonObject
 from jaxprt.relit.channels import Appearance, Changeable, Shading, roughness_range
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Camera, Environment, Mesh, Scene, TexturedMaterial
 from jaxprt.scene.environment import add_disk, rotate, sky
 from jaxprt.systems import standard
-from jaxprt.view.messages import Lamp, Look
+from jaxprt.view.messages import Lamp, Look, Message
 from jaxprt.view.unshadowed import Unshadowed
 
 _KEPT = 4  # cached results of each stage
@@ -29,6 +30,13 @@ _VALUES = 4  # of roughness that are tried for their programs
 _PARTS = 8  # most parts whose materials are changed for their programs
 
 Made = TypeVar("Made")
+
+
+def relit(scene: RelitScene | Unshadowed) -> RelitScene:
+    """The scene, if its rays have been traced."""
+    if isinstance(scene, Unshadowed):
+        raise ValueError("colors must have rays, which are still being traced")
+    return scene
 
 
 class Stages:
@@ -62,10 +70,7 @@ class Stages:
 
     def system(self, look: Look) -> RelitScene:
         """The relit scene of the system that a look names."""
-        system = (self.systems if look.bounces else self._bare)[look.system]
-        if isinstance(system, Unshadowed):
-            raise ValueError("colors must have rays, which are still being traced")
-        return system
+        return relit((self.systems if look.bounces else self._bare)[look.system])
 
     def unturned(self, number: int, lamps: tuple[Lamp, ...]) -> Environment:
         """A light with the lamps added, before rotation."""
@@ -110,7 +115,7 @@ class Stages:
         key = look.system, look.material
         return self._once("material", key, lambda: self.system(look).appearances(self.materials(look)))
 
-    def light_side(self, look: Look) -> Any:
+    def light_side(self, look: Look) -> PyTree:
         """The part of the system's computation that depends only on the light."""
         system = self.system(look)
         light_key = look.system, look.bounces, look.light, look.lamps, look.turn
@@ -120,7 +125,7 @@ class Stages:
         key = (*light_key, look.material)
         return self._once("shade", key, lambda: system.shade(light, self.appearances(look)))
 
-    def view_side(self, look: Look) -> Any:
+    def view_side(self, look: Look) -> PyTree:
         """The part of the system's computation that depends only on the eye and the materials."""
         key = look.system, look.bounces, look.eye, look.material
         eye = jnp.asarray(look.eye, jnp.result_type(float))
@@ -259,7 +264,7 @@ def straight(color: Float[np.ndarray, "h w c"], alpha: Float[np.ndarray, "h w 1"
 
 
 def about(angle: float) -> Float[Array, "3 3"]:
-    """Rotation matrix about +y by an angle in radians."""
+    """Rotation matrix about the vertical by an angle in radians, from +z towards +x."""
     c, s = np.cos(angle), np.sin(angle)
     return jnp.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]], jnp.result_type(float))
 
@@ -279,7 +284,7 @@ def camera(look: Look, width: int, height: int) -> Camera:
     return Camera(list(look.eye), list(look.target), [0.0, 1.0, 0.0], look.field_of_view, width, height)
 
 
-def freedom(shading: Shading, material: Any) -> dict[str, Any] | None:
+def freedom(shading: Shading, material: object) -> JsonObject | None:
     """Parameters of a part's material that the viewer can change, with their values; None for a fixed BRDF."""
     if isinstance(material, BlinnPhong) and shading.blend is not None:
         specular = np.broadcast_to(np.asarray(material.specular, float), (3,))
@@ -304,7 +309,7 @@ def freedom(shading: Shading, material: Any) -> dict[str, Any] | None:
         }
     if not isinstance(material, TexturedMaterial):
         return None
-    free: dict[str, Any] = {"diffuse": np.asarray(material.base_color).tolist()}
+    free: JsonObject = {"diffuse": np.asarray(material.base_color).tolist()}
     if shading.matte:
         return free
     low, high = roughness_range(shading)
@@ -318,7 +323,7 @@ def freedom(shading: Shading, material: Any) -> dict[str, Any] | None:
     return free
 
 
-def change_material(material: Any, name: str, values: Mapping[str, Any]) -> Changeable:
+def change_material(material: object, name: str, values: Message) -> Changeable:
     """The material with other values of roughness, metallicity, reflectance and colors."""
     if isinstance(material, BlinnPhong):
         new = {key: jnp.asarray(values[key]) for key in ("diffuse", "exponent") if key in values}
@@ -334,7 +339,7 @@ def change_material(material: Any, name: str, values: Mapping[str, Any]) -> Chan
         return dataclasses.replace(material, **new)
     if not isinstance(material, TexturedMaterial):
         raise ValueError(f"the material of part {name!r} is a BRDF, which cannot change in the viewer")
-    new: dict[str, Any] = {key: values[key] for key in ("roughness", "metallic") if key in values}
+    new: JsonObject = {key: values[key] for key in ("roughness", "metallic") if key in values}
     if "diffuse" in values:
         new["base_color"] = jnp.asarray(values["diffuse"])
     if "f0" in values or "specular" in values:
@@ -342,7 +347,7 @@ def change_material(material: Any, name: str, values: Mapping[str, Any]) -> Chan
     return dataclasses.replace(material, **new)
 
 
-def _tint(color: Any, white: float, values: Mapping[str, Any]) -> Float[Array, "3"]:
+def _tint(color: Array | np.ndarray, white: float, values: Message) -> Float[Array, "3"]:
     """A specular color with another strength or tint. A strength of 1 has the reflectance `white`."""
     old = np.broadcast_to(np.asarray(color), (3,))
     strength = values["f0"] / white if "f0" in values else float(old.max())

@@ -13,6 +13,7 @@ import traitlets
 from IPython.display import display
 
 from jaxprt import files
+from jaxprt.files.inputs import JsonObject
 from jaxprt.view import browser
 from jaxprt.view.session import Session
 
@@ -79,6 +80,6 @@ class Viewer(anywidget.AnyWidget):
             threads = kinds.get(str(message["content"].get("kind")), self._looks)
             threads.submit(self._answer, message, [bytes(buffer) for buffer in buffers])
 
-    def _answer(self, message: dict[str, Any], buffers: list[bytes]) -> None:
+    def _answer(self, message: JsonObject, buffers: list[bytes]) -> None:
         content, arrays = self.session.answer(message["content"], buffers)
         self.send({"id": message.get("id"), "content": content}, arrays)

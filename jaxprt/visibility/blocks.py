@@ -13,15 +13,16 @@ import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import tqdm
+from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from jaxprt import require
 from jaxprt.files import arrays
-from jaxprt.files.arrays import BlockStore, Layout
+from jaxprt.files.arrays import BlockStore, Header, Layout
 
 _HELD = 1 << 28  # bytes of results, and of copies of a job, that may be in flight at once
 _MOST = 4096  # blocks that may be in flight at once
@@ -36,7 +37,7 @@ class Job(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def header(self) -> Mapping[str, Any]:
+    def header(self) -> Header:
         """Everything that the result depends on, as JSON values. Equal headers and `near` mean equal results.
 
         It holds the name of the `system` and the version of its `algorithm`, which a release raises if results change.
@@ -232,7 +233,7 @@ class ProgressBar(contextlib.AbstractContextManager):
         self._told = -np.inf
         self.update(0)
 
-    def __exit__(self, *error: Any) -> None:
+    def __exit__(self, *error: object) -> None:
         """Ends the line of the terminal."""
         self._bar.close()
 
@@ -287,7 +288,7 @@ class _Memory:
             into[...] = array[name][(*before, slice(into.shape[at.axis]))]
 
 
-def fingerprint(*array: Any) -> str:
+def fingerprint(*array: ArrayLike) -> str:
     """SHA-256 of the shapes, types and bytes of some arrays."""
     digest = hashlib.sha256()
     for value in array:

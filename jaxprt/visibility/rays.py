@@ -35,31 +35,30 @@ _KRONECKER = 0.6180339887498949, 0.7548776662466927  # of texels and vertices
 _RAYS = 1 << 17  # rays per call, so that they fit in a core's cache
 
 
-def _mesh(value: Any) -> None:
+def _mesh(value: object) -> None:
     require.kind("the mesh", value, Mesh, source=_SOURCE)
     check_kinds(value, "the mesh")
 
 
-def _occluder(value: Any) -> None:
+def _occluder(value: object) -> None:
     if value is not None:
         require.kind("the occluder", value, Mesh, source=_SOURCE)
         check_kinds(value, "the occluder")
 
 
-def _vertex(value: Any) -> None:
+def _vertex(value: object) -> None:
     if value is not None:
         wrong = require.unreal(value)
         if wrong and wrong != "booleans":
             raise TypeError(f"vertex must be a mask or indices, got {wrong}")
 
 
-def _run(value: Any) -> None:
+def _run(value: object) -> None:
     require.kind("run", value, blocks.Run, source="jaxprt.Run")
 
 
-def _size(value: Any) -> None:
-    require.whole("size", value)  # Systems say which smaller sizes they take.
-    if value > _MOST:
+def _size(value: object) -> None:
+    if require.whole("size", value) > _MOST:  # Systems say which smaller sizes they take.
         raise ValueError(f"size must be at most {_MOST}, got {value}")
 
 
@@ -225,7 +224,7 @@ class VisibilityJob(blocks.Job):
         vars(job)["rays"] = occluder_rays  # the cached property, so that Embree builds its tree once
         return job
 
-    def made_by(self, system: str, algorithm: Mapping[str, int], **more: Any) -> dict[str, Any]:
+    def made_by(self, system: str, algorithm: Mapping[str, int], **more: object) -> dict[str, object]:
         """The header of a system's job: the inputs, and the versions of the algorithms."""
         return {"system": system, "algorithm": dict(algorithm), "mesh": self.mesh_key, "size": self.size, **more}
 
@@ -239,7 +238,7 @@ class VisibilityJob(blocks.Job):
         """The occluder as an Embree scene, built once in each worker process."""
         return Occluder(self.occluder)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """The fields only, because an Embree scene cannot be pickled."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 

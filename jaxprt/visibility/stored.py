@@ -7,7 +7,6 @@ computed from stored visibility without tracing rays again.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from jaxprt import require
-from jaxprt.files.arrays import Layout
+from jaxprt.files.arrays import Header, Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import haar
 from jaxprt.visibility import blocks, rays
@@ -128,7 +127,7 @@ class _Job(rays.VisibilityJob):
     """Job that computes blocks of visibility."""
 
     @property
-    def header(self) -> Mapping[str, Any]:
+    def header(self) -> Header:
         return self.made_by("direct", ALGORITHM)
 
     @property

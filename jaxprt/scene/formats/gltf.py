@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxprt.files.inputs import JsonObject
 from jaxprt.scene.camera import Camera
 from jaxprt.scene.environment import Sun
 from jaxprt.scene.formats import gltf_geometry, gltf_nodes, text
@@ -29,7 +30,7 @@ from jaxprt.scene.formats.gltf_file import (
     unread_extensions,
 )
 from jaxprt.scene.formats.gltf_nodes import Node
-from jaxprt.scene.material import Texture, TexturedMaterial
+from jaxprt.scene.material import Fields, Texture, TexturedMaterial
 from jaxprt.scene.scene import PointLight, Scene, unique_names
 
 _HEIGHT = 512  # height of cameras' pictures in pixels
@@ -143,7 +144,7 @@ def _cameras(document: Document, nodes: Sequence[Node], center: np.ndarray) -> t
     return cameras, skipped
 
 
-def _camera(document: Document, item: dict[str, Any], owner: str, matrix: np.ndarray, center: np.ndarray) -> Camera:
+def _camera(document: Document, item: JsonObject, owner: str, matrix: np.ndarray, center: np.ndarray) -> Camera:
     """A camera, transformed by its node. Its target is as far away as the center of the scene."""
     angle, aspect = (document.number(item, *field) for field in (("yfov", owner, None), ("aspectRatio", owner, 1.0)))
     if not 0 < angle < math.pi or not 0 < aspect < _WIDEST:
@@ -179,7 +180,7 @@ class MaterialReader:
         item = document.item("materials", index, owner)
         holder = {"": item} | {key: document.field(item, key, owner, dict) for key in (_PBR, "normalTexture")}
         holder |= {name: document.extension(item, f"KHR_materials_{name}", owner) for name in _EXTENSIONS}
-        field: dict[str, Any] = {
+        field: Fields = {
             key: document.number(holder[name], factor, owner, default)
             for key, (name, factor, default) in _FACTORS.items()
         }
@@ -198,7 +199,7 @@ class MaterialReader:
         except ValueError as error:
             raise ValueError(f"{document.path}, {owner}: {error}") from error
 
-    def _note(self, item: dict[str, Any], coat: dict[str, Any], field: dict[str, Any]) -> None:
+    def _note(self, item: JsonObject, coat: JsonObject, field: Fields) -> None:
         """Records unsupported features of a material, and removes its sheen under a clear coat."""
         if "occlusionTexture" in item:
             self.ignored.add("occlusion textures (occlusion is computed)")
@@ -213,7 +214,7 @@ class MaterialReader:
             field["sheen_color"] = np.zeros(3, np.float32)
         self.ignored |= set(item.get("extensions", {}))
 
-    def _cover(self, item: dict[str, Any], alpha: float, owner: str) -> dict[str, Any]:
+    def _cover(self, item: JsonObject, alpha: float, owner: str) -> Fields:
         """What a material hides: its alpha, and its back (sections 3.9.4 and 3.9.5)."""
         back = "lit" if self._document.field(item, "doubleSided", owner, bool) else "hidden"
         mode = item.get("alphaMode", "OPAQUE")
@@ -226,7 +227,7 @@ class MaterialReader:
         return {"back": back}
 
     def _texture(
-        self, item: dict[str, Any], key: str, channels: tuple[int, ...], owner: str, *, decoded: bool
+        self, item: JsonObject, key: str, channels: tuple[int, ...], owner: str, *, decoded: bool
     ) -> Texture | None:
         """Some channels of a texture; None if there is no texture that can be read."""
         if key not in item:
@@ -260,14 +261,14 @@ class MaterialReader:
             return None
         return Texture(pixels, self._transform(moved, owner), number, (across, up))
 
-    def _source(self, texture: dict[str, Any], name: str) -> Any:
+    def _source(self, texture: JsonObject, name: str) -> Any:
         """The image of a texture: PNG or JPEG, or else that of an extension; None if there is none."""
         if "source" in texture:
             return texture["source"]
         used = (self._document.extension(texture, key, name).get("source") for key in _SOURCES)
         return next((source for source in used if source is not None), None)
 
-    def _transform(self, moved: dict[str, Any], owner: str) -> np.ndarray:
+    def _transform(self, moved: JsonObject, owner: str) -> np.ndarray:
         """The affine transform of KHR_texture_transform, for texture coordinates with v up."""
         (x, y), (across, down), angle = (
             self._document.number(moved, key, owner, default)
@@ -287,7 +288,7 @@ def _lights(
     """Point lights and spots, suns, and what is not read; none for a scale of 0. Parts have the `names`."""
     if scale == 0:
         return [], [], set()
-    placed: list[tuple[dict[str, Any], str, Node]] = []
+    placed: list[tuple[JsonObject, str, Node]] = []
     ignored: set[str] = set()
     items = document.field(document.extension(document.header, LIGHTS, "the file"), "lights", LIGHTS, list)
     for node in nodes:
@@ -331,7 +332,7 @@ def _light_axis(document: Document, node: Node, owner: str) -> np.ndarray:
     return axis / length
 
 
-def _cone(document: Document, item: dict[str, Any], node: Node, owner: str) -> dict[str, Any]:
+def _cone(document: Document, item: JsonObject, node: Node, owner: str) -> JsonObject:
     """The axis and the angles of a spot."""
     spot = document.field(item, "spot", owner, dict)
     inner, outer = (

@@ -19,6 +19,7 @@ import numpy as np
 
 from jaxprt import require
 from jaxprt.files import inputs
+from jaxprt.files.inputs import JsonObject
 
 _SLACK = 64  # bytes of compressed data besides which a header can be short
 _SHOWN = 80  # characters of a wrong value in messages
@@ -77,7 +78,7 @@ class Header:
     def __init__(self, path: pathlib.Path, text: bytes):
         """Parses the JSON text of the header, which may start with a byte order mark."""
         self.path = path
-        self._items: dict[str, list[dict[str, Any]]] = {}
+        self._items: dict[str, list[JsonObject]] = {}
         self._decoded = 0  # bytes
         try:
             header = json.loads(text, object_pairs_hook=inputs.unique_names)  # section 2.6
@@ -85,7 +86,7 @@ class Header:
             raise self.error("must be an undamaged glTF file", f"a header that is not JSON: {error}") from error
         if not isinstance(header, dict):
             raise self.error("must be an undamaged glTF file with an object as its header", excerpt(header))
-        self.header: dict[str, Any] = header
+        self.header: JsonObject = header
         asset = self.field(header, "asset", "the file", dict)
         version = str(asset.get("version", "none"))
         if not version.startswith("2."):
@@ -98,7 +99,7 @@ class Header:
         """An error that names the file."""
         return ValueError(f"{self.path} {required}, got {got}")
 
-    def items(self, kind: str) -> list[dict[str, Any]]:
+    def items(self, kind: str) -> list[JsonObject]:
         """All objects of a kind, such as "meshes"; may be empty."""
         if kind not in self._items:
             items = self.header.get(kind, [])
@@ -111,7 +112,7 @@ class Header:
             self._items[kind] = items
         return self._items[kind]
 
-    def change(self, kind: str, fields: Mapping[int, Mapping[str, Any]]) -> None:
+    def change(self, kind: str, fields: Mapping[int, JsonObject]) -> None:
         """Replaces fields of some objects of a kind, by their indices. The header itself keeps its fields."""
         self._items[kind] = [{**item, **fields.get(index, {})} for index, item in enumerate(self.items(kind))]
 
@@ -122,7 +123,7 @@ class Header:
             raise self.error(f"must refer to one of its {len(items)} {kind} in {owner}", excerpt(value))
         return int(value)
 
-    def item(self, kind: str, value: Any, owner: str) -> dict[str, Any]:
+    def item(self, kind: str, value: object, owner: str) -> JsonObject:
         """The object of a kind that has an index; arguments and errors are those of `index`."""
         return self.items(kind)[self.index(kind, value, owner)]
 
@@ -144,7 +145,7 @@ class Header:
             raise self.error(f"must have {must} for {key} of {owner}", excerpt(value))
         return int(value) if kind is int else value
 
-    def objects(self, item: Mapping[str, Any], key: str, owner: str, what: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    def objects(self, item: JsonObject, key: str, owner: str, what: str) -> Iterator[tuple[str, JsonObject]]:
         """The objects of a field that is a list of them, each with its name, such as "channel 0 of animation 2"."""
         for index, value in enumerate(self.field(item, key, owner, list)):
             name = f"{what} {index} of {owner}"
@@ -152,7 +153,7 @@ class Header:
                 raise self.error(f"must have an object for {name}", excerpt(value))
             yield name, value
 
-    def extension(self, item: Mapping[str, Any], key: str, owner: str) -> dict[str, Any]:
+    def extension(self, item: JsonObject, key: str, owner: str) -> JsonObject:
         """An extension of an object; empty if it is missing."""
         return self.field(self.field(item, "extensions", owner, dict), key, owner, dict)
 
@@ -164,7 +165,7 @@ class Header:
                 raise self.error(f"must have a list of strings for {key} of the file", f"{excerpt(value)} in it")
         return values
 
-    def number(self, item: Mapping[str, Any], key: str, owner: str, default: float | Sequence[float] | None) -> Any:
+    def number(self, item: JsonObject, key: str, owner: str, default: float | Sequence[float] | None) -> Any:
         """A field that is a number, or a list of as many numbers as its default; None requires the field."""
         return self.numbers(item.get(key, default), np.shape(0 if default is None else default), f"{key} of {owner}")
 
@@ -192,26 +193,24 @@ class Header:
         require.memory(f"the decoded data of {self.path}", self._decoded, "load a smaller scene")
 
 
-def excerpt(value: Any) -> str:
+def excerpt(value: object) -> str:
     """A value of a header for an error message, cut where it is long."""
     text = repr(value)
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
 
 
-def _is_whole(value: Any) -> bool:
+def _is_whole(value: object) -> bool:
     """Whether a JSON number is whole, as 3 and 3.0 are. Booleans are no numbers."""
     return type(value) is int or (type(value) is float and value.is_integer())
 
 
-def _is_fallback(header: Header, buffer: dict[str, Any], name: str) -> bool:
+def _is_fallback(header: Header, buffer: JsonObject, name: str) -> bool:
     """Whether a buffer only stands in for compressed data and has no bytes."""
     stated = any(header.extension(buffer, key, name).get("fallback") is True for key in MESHOPT)
     return stated and "uri" not in buffer
 
 
-def _decode_meshopt(
-    document: Header, view: dict[str, Any], extension: dict[str, Any], content: memoryview, name: str
-) -> bytes:
+def _decode_meshopt(document: Header, view: JsonObject, extension: JsonObject, content: memoryview, name: str) -> bytes:
     """The bytes of the compressed buffer view `name`, whose extension is EXT_meshopt_compression."""
     owner = f"{MESHOPT[0]} of {name}" if MESHOPT[0] in view["extensions"] else f"{MESHOPT[1]} of {name}"
     count, stride = (document.field(extension, key, owner, int) for key in ("count", "byteStride"))
@@ -298,7 +297,7 @@ class Elements(NamedTuple):
 class Form(NamedTuple):
     """The header of an accessor."""
 
-    item: dict[str, Any]  # the JSON object
+    item: JsonObject  # the JSON object
     name: str  # for messages
     dtype: np.dtype
     rows: int  # number of elements
@@ -327,7 +326,7 @@ class Document(Header):
             text, self._chunk = self._chunks(content)
         super().__init__(path, text)
 
-    def view(self, value: Any, owner: str) -> tuple[memoryview, int]:
+    def view(self, value: object, owner: str) -> tuple[memoryview, int]:
         """The bytes of a buffer view, and its stride; 0 if elements are contiguous."""
         index = self.index("bufferViews", value, owner)
         if index not in self._view:
@@ -335,7 +334,7 @@ class Document(Header):
             self._view[index] = self._decompressed(item, name), self.field(item, "byteStride", name, int, 0)
         return self._view[index]
 
-    def accessor(self, value: Any, owner: str, *widths: int, whole: bool = False) -> Elements:
+    def accessor(self, value: object, owner: str, *widths: int, whole: bool = False) -> Elements:
         """The elements of an accessor (section 3.6.2).
 
         Args:
@@ -359,7 +358,7 @@ class Document(Header):
             place, replacement = self._sparse(self.field(item, "sparse", name, dict), name, array)
         return Elements(array, place, replacement, most)
 
-    def form(self, value: Any, owner: str, *widths: int, whole: bool = False) -> Form:
+    def form(self, value: object, owner: str, *widths: int, whole: bool = False) -> Form:
         """The header of an accessor; arguments and errors are those of `accessor`. No data are read."""
         index = self.index("accessors", value, owner)
         item, name = self.items("accessors")[index], f"accessor {index} ({owner})"
@@ -418,7 +417,7 @@ class Document(Header):
             place += 8 + extent
         return content[20 : 20 + size], binary
 
-    def _decompressed(self, view: dict[str, Any], name: str) -> memoryview:
+    def _decompressed(self, view: JsonObject, name: str) -> memoryview:
         """The bytes of a buffer view. Compressed views are decoded where they have no uncompressed fallback."""
         index = self.index("buffers", view.get("buffer"), name)
         buffer, used = self.items("buffers")[index], self.field(view, "extensions", name, dict)
@@ -429,7 +428,7 @@ class Document(Header):
         content = self._cut(extension, f"the compressed data of {name}")
         return memoryview(_decode_meshopt(self, view, extension, content, name))
 
-    def _cut(self, item: dict[str, Any], name: str) -> memoryview:
+    def _cut(self, item: JsonObject, name: str) -> memoryview:
         """The bytes of a buffer that an object names."""
         content = self._bytes(self.index("buffers", item.get("buffer"), name))
         start = self.field(item, "byteOffset", name, int, 0)
@@ -475,7 +474,7 @@ class Document(Header):
         name, folder, owner = urllib.parse.unquote(uri), self.path.parent, f"{self.path}, {owner}"
         return inputs.reference(name, folder, folder=folder, owner=owner, outside=self._outside)
 
-    def _strided(self, item: dict[str, Any], name: str, dtype: np.dtype, shape: tuple[int, int]) -> np.ndarray:
+    def _strided(self, item: JsonObject, name: str, dtype: np.dtype, shape: tuple[int, int]) -> np.ndarray:
         """The elements of a buffer view, without a copy."""
         content, stride = self.view(item.get("bufferView"), name)
         offset, size = self.field(item, "byteOffset", name, int, 0), dtype.itemsize * shape[1]
@@ -488,7 +487,7 @@ class Document(Header):
             )
         return np.ndarray(shape, dtype, content, offset, (stride, dtype.itemsize))
 
-    def _sparse(self, item: dict[str, Any], name: str, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _sparse(self, item: JsonObject, name: str, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Numbers of the elements that a sparse accessor replaces, and what replaces them (section 3.6.2.3)."""
         indices, values = self.field(item, "indices", name, dict), self.field(item, "values", name, dict)
         count, kind = self.field(item, "count", name, int), self.field(indices, "componentType", name, int)
@@ -502,6 +501,6 @@ class Document(Header):
         return place[order], self._strided(values, name, value.dtype, (count, value.shape[1]))[order]
 
 
-def _names_file(uri: Any) -> TypeGuard[str]:
+def _names_file(uri: object) -> TypeGuard[str]:
     """Whether a URI names a file. Others hold the data, or are none."""
     return isinstance(uri, str) and bool(uri) and uri[:5].lower() != "data:"

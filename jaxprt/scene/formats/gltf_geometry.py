@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxprt import require
+from jaxprt.files.inputs import JsonObject
 from jaxprt.scene.formats.geometry import Geometry, cofactors, flat, instances, join_geometries, with_area
 from jaxprt.scene.formats.gltf_file import (
     DRACO,
@@ -171,7 +172,7 @@ class _DracoReader:
         self._document = document
         self._mesh: dict[int, Any] = {}
 
-    def primitive(self, item: dict[str, Any], name: str) -> dict[str, Elements]:
+    def primitive(self, item: JsonObject, name: str) -> dict[str, Elements]:
         """The compressed attributes of a primitive, and its "indices"; empty if all its accessors have data."""
         document = self._document
         extensions = document.field(item, "extensions", name, dict)
@@ -206,7 +207,7 @@ class _DracoReader:
             result[key] = Elements(value, np.zeros(0, np.int64), value[:0], form.most)
         return result
 
-    def _decoded(self, extension: dict[str, Any], owner: str, corners: int, vertices: int) -> Any:
+    def _decoded(self, extension: JsonObject, owner: str, corners: int, vertices: int) -> Any:
         """The decoded mesh of a buffer view, whose header must state as many triangles as the primitive has."""
         document = self._document
         index = document.index("bufferViews", extension.get("bufferView"), owner)
@@ -431,7 +432,7 @@ def _primitives(
 
 def _elements(
     document: Document,
-    attribute: dict[str, Any],
+    attribute: JsonObject,
     skinned: bool,
     decoded: dict[str, Elements],
     name: str,

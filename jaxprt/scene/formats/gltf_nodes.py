@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxprt.files import inputs
+from jaxprt.files.inputs import JsonObject
 from jaxprt.scene.formats.gltf_file import INSTANCING, LARGEST_FLOAT, Document, Elements, excerpt
 
 _TRANSFORM = {"TRANSLATION": (3,), "ROTATION": (4,), "SCALE": (3,)}  # attributes of instances, and their components
@@ -24,7 +25,7 @@ class Node(NamedTuple):
     """A node with its transform to world coordinates."""
 
     number: int  # index of the node
-    item: dict[str, Any]  # its JSON object
+    item: JsonObject  # its JSON object
     matrix: np.ndarray  # [4 4]
 
 
@@ -243,7 +244,7 @@ def pose(document: Document, time: float, animation: str | int | None) -> set[st
     index = _animation_index(document, animation)
     owner, item = f"animation {index}", document.items("animations")[index]
     samplers, ignored = document.field(item, "samplers", owner, list), set()
-    moved: dict[int, dict[str, Any]] = {}
+    moved: dict[int, JsonObject] = {}
     for name, channel in document.objects(item, "channels", owner, "channel"):
         target = document.field(channel, "target", name, dict)
         path = document.field(target, "path", name, str)

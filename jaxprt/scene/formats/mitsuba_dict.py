@@ -26,9 +26,11 @@ from jaxprt.scene.environment import Environment
 from jaxprt.scene.formats import mesh_file
 from jaxprt.scene.formats.file_parts import FLIP, split_parts, warn_of_ignored
 from jaxprt.scene.formats.geometry import Geometry, place
-from jaxprt.scene.material import Texture, TexturedMaterial
+from jaxprt.scene.material import Fields, Texture, TexturedMaterial
 from jaxprt.scene.mesh import grid_face
 from jaxprt.scene.scene import Part, Scene
+
+Plugin = Mapping[str, Any]  # a dictionary of `mitsuba.load_dict`, whose values are parameters and other plugins
 
 _LUMINANCE = np.array([0.212671, 0.715160, 0.072169])  # Rec. 709 weights of Mitsuba's textures
 _WRAPPERS = {"twosided", "mask", "bumpmap", "normalmap"}
@@ -89,7 +91,7 @@ _SILENT = {"path", "direct", "volpath", "volpathmis", "ptracer", "aov", "prb", "
 _SILENT |= {"prb_projective", "independent", "multijitter", "orthogonal", "stratified", "ldsampler", "moment", "depth"}
 
 
-def rgb(value: Any, name: str) -> np.ndarray:
+def rgb(value: object, name: str) -> np.ndarray:
     """A color [3] from a number, three numbers, or a dictionary of type rgb, srgb, uniform or spectrum."""
     if isinstance(value, Mapping):
         inner = value.get("value", value.get("color"))
@@ -106,7 +108,7 @@ def rgb(value: Any, name: str) -> np.ndarray:
     return np.broadcast_to(color, (3,))
 
 
-def _array(value: Any) -> np.ndarray | None:
+def _array(value: object) -> np.ndarray | None:
     """Finite numbers as an array without axes of length 1; None for other values."""
     if require.unreal(value):
         return None
@@ -122,21 +124,21 @@ def _refused(check: Callable, *arguments: Any, **options: Any) -> None:
         raise ValueError(str(error)) from error
 
 
-def _number(item: Mapping[str, Any], key: str, default: float, name: str, low: float, **options: Any) -> float:
+def _number(item: Plugin, key: str, default: float, name: str, low: float, **options: Any) -> float:
     """A parameter that is one number, within the range of `require.number`."""
     value = item.get(key, default)
     _refused(require.number, f"{key} of {name}", value, low, **options)
     return float(value)
 
 
-def _flag(item: Mapping[str, Any], key: str, default: bool, name: str) -> bool:
+def _flag(item: Plugin, key: str, default: bool, name: str) -> bool:
     value = item.get(key, default)
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{key} of {name} must be True or False, got {require.shown(value)}")
     return bool(value)
 
 
-def _word(item: Mapping[str, Any], key: str, name: str, words: tuple[str, ...]) -> str:
+def _word(item: Plugin, key: str, name: str, words: tuple[str, ...]) -> str:
     """A parameter that is one of some words, the first by default."""
     value = item.get(key, words[0])
     if not isinstance(value, str) or value not in words:
@@ -144,14 +146,14 @@ def _word(item: Mapping[str, Any], key: str, name: str, words: tuple[str, ...]) 
     return value
 
 
-def _file(item: Mapping[str, Any], name: str) -> pathlib.Path:
+def _file(item: Plugin, name: str) -> pathlib.Path:
     if "filename" not in item:
         raise ValueError(f"{name} must have a filename, got {', '.join(map(str, item))}")
     _refused(require.path, f"filename of {name}", item["filename"])
     return pathlib.Path(os.fspath(item["filename"]))
 
 
-def _kind(item: Mapping[str, Any], name: str) -> str:
+def _kind(item: Plugin, name: str) -> str:
     """The type of a plugin."""
     kind = item.get("type")
     if not isinstance(kind, str):
@@ -162,7 +164,7 @@ def _kind(item: Mapping[str, Any], name: str) -> str:
 class MaterialMaker:
     """Converts BSDFs in the dictionary of a scene to materials. Records unsupported parameters."""
 
-    def __init__(self, scene: Mapping[str, Any], ignored: set[str]):
+    def __init__(self, scene: Plugin, ignored: set[str]):
         self._scene, self._ignored = scene, ignored
 
     @staticmethod
@@ -170,7 +172,7 @@ class MaterialMaker:
         """Whether a plugin type is a BSDF or texture, which is read only if a shape refers to it."""
         return kind in _MAKERS | _WRAPPERS | {"bitmap", "rgb", "ref"}
 
-    def of_shape(self, name: str, item: Mapping[str, Any]) -> TexturedMaterial:
+    def of_shape(self, name: str, item: Plugin) -> TexturedMaterial:
         """The material of a shape, including its emission. Without a BSDF it is Mitsuba's default gray of 0.5."""
         emitted, fields = [], []
         for key, plugin in self.plugins(item, name).items():
@@ -187,7 +189,7 @@ class MaterialMaker:
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
 
-    def plugins(self, item: Mapping[str, Any], name: str, kind: str = "") -> dict[str, Mapping[str, Any]]:
+    def plugins(self, item: Plugin, name: str, kind: str = "") -> dict[str, Plugin]:
         """Plugins that a plugin holds. Records its parameters that are not read, unless they are zero.
 
         `kind` is the entry of the table of parameters, if it is not the type.
@@ -206,11 +208,11 @@ class MaterialMaker:
                 self._ignored.add(f"{key} of {name}")
         return result
 
-    def rest(self, item: Mapping[str, Any], name: str) -> None:
+    def rest(self, item: Plugin, name: str) -> None:
         """Records all that is not read of a plugin that holds no others."""
         self._ignored |= {f"{key} of {name}" for key in self.plugins(item, name)}
 
-    def _resolved(self, item: Any, name: str) -> Mapping[str, Any] | None:
+    def _resolved(self, item: Any, name: str) -> Plugin | None:
         """A nested dictionary, or the dictionary of the scene that it refers to; None for other values."""
         if not isinstance(item, Mapping):
             return None
@@ -221,7 +223,7 @@ class MaterialMaker:
             raise ValueError(f"{name} must refer to something in the scene, got {require.shown(item.get('id'))}")
         return target
 
-    def _field(self, item: Mapping[str, Any], name: str, depth: int = 1) -> dict[str, Any]:
+    def _field(self, item: Plugin, name: str, depth: int = 1) -> Fields:
         """Factors and textures of the material for a BSDF, which `depth - 1` others hold."""
         kind = item["type"]
         if depth > _DEEPEST:
@@ -242,7 +244,7 @@ class MaterialMaker:
             "roughplastic": self._plastic,
         }[kind](item, name)
 
-    def _wrapped(self, item: Mapping[str, Any], name: str, depth: int) -> dict[str, Any]:
+    def _wrapped(self, item: Plugin, name: str, depth: int) -> Fields:
         """Factors and textures for a BSDF that holds another."""
         kind, inner = item["type"], []
         for key, plugin in self.plugins(item, name).items():
@@ -254,7 +256,7 @@ class MaterialMaker:
             raise ValueError(f"{name} must hold a BSDF, got {', '.join(map(str, item))}")
         if len(inner) > 1:
             self._ignored.add(f"the second BSDF of {name}")
-        wrapped: dict[str, Any] = {}
+        wrapped: Fields = {}
         if kind == "twosided":
             wrapped = {"back": "lit"}
         elif kind == "mask":
@@ -268,7 +270,7 @@ class MaterialMaker:
             wrapped["alpha"] = wrapped.get("alpha", 1.0) * field.get("alpha", 1.0)
         return field | wrapped
 
-    def _opacity(self, item: Mapping[str, Any], name: str) -> dict[str, Any]:
+    def _opacity(self, item: Plugin, name: str) -> Fields:
         """The share of light that a `mask` stops. Colors count by their mean, bitmaps by their luminance."""
         value = self._resolved(item.get("opacity"), f"opacity of {name}")
         if value is not None and value.get("type") == "bitmap":
@@ -277,10 +279,10 @@ class MaterialMaker:
             "alpha": float(np.mean(rgb(item.get("opacity", 0.5) if value is None else value, f"opacity of {name}")))
         }
 
-    def _diffuse(self, item: Mapping[str, Any], name: str) -> dict[str, Any]:
+    def _diffuse(self, item: Plugin, name: str) -> Fields:
         return {"metallic": 0.0, "specular": 0.0} | self._color(item, "reflectance", 0.5, name)
 
-    def _principled(self, item: Mapping[str, Any], name: str) -> dict[str, Any]:
+    def _principled(self, item: Plugin, name: str) -> Fields:
         """Converts `principled`. Alpha along and across the tangent equals Mitsuba's, including anisotropy."""
         field = self._color(item, "base_color", 0.5, name)
         field |= self._scalar(item, "metallic", 0.0, name) | self._scalar(item, "roughness", 0.5, name)
@@ -297,7 +299,7 @@ class MaterialMaker:
             field |= _roughness_and_anisotropy(field["roughness"] ** 2 / aspect, field["roughness"] ** 2 * aspect)
         return field
 
-    def _conductor(self, item: Mapping[str, Any], name: str) -> dict[str, Any]:
+    def _conductor(self, item: Plugin, name: str) -> Fields:
         material = item.get("material", "Cu")
         if "eta" in item and "k" in item and "material" not in item:
             eta, k = rgb(item["eta"], f"eta of {name}"), rgb(item["k"], f"k of {name}")
@@ -320,7 +322,7 @@ class MaterialMaker:
             return field | {"metallic": 1.0, "rotation": math.pi / 2} | _roughness_and_anisotropy(alpha[1], alpha[0])
         return field | {"metallic": 1.0} | _roughness_and_anisotropy(*alpha)
 
-    def _plastic(self, item: Mapping[str, Any], name: str) -> dict[str, Any]:
+    def _plastic(self, item: Plugin, name: str) -> Fields:
         outer = _number(item, "ext_ior", 1.000277, name, 0.0, above=True)
         ratio = _number(item, "int_ior", 1.49, name, 0.0, above=True) / outer
         alpha = 0.0
@@ -331,7 +333,7 @@ class MaterialMaker:
         field = self._color(item, "diffuse_reflectance", 0.5, name)
         return field | {"metallic": 0.0, "roughness": math.sqrt(alpha), "ior": ratio}
 
-    def _color(self, item: Mapping[str, Any], key: str, default: float, name: str) -> dict[str, Any]:
+    def _color(self, item: Plugin, key: str, default: float, name: str) -> Fields:
         value = self._resolved(item.get(key), f"{key} of {name}")
         if value is not None and value.get("type") == "bitmap":
             return {
@@ -340,7 +342,7 @@ class MaterialMaker:
             }
         return {"base_color": rgb(item.get(key, default) if value is None else value, f"{key} of {name}")}
 
-    def _scalar(self, item: Mapping[str, Any], key: str, default: float, name: str) -> dict[str, Any]:
+    def _scalar(self, item: Plugin, key: str, default: float, name: str) -> Fields:
         value = self._resolved(item.get(key), f"{key} of {name}")
         if value is not None and value.get("type") == "bitmap":
             return {key: 1.0, f"{key}_texture": self._texture(value, f"{key} of {name}", colors=False)}
@@ -349,7 +351,7 @@ class MaterialMaker:
             raise ValueError(f"{key} of {name} must be one number or a bitmap, got the color {color.tolist()}")
         return {key: float(color[0])}
 
-    def _texture(self, item: Mapping[str, Any], name: str, *, colors: bool) -> Texture:
+    def _texture(self, item: Plugin, name: str, *, colors: bool) -> Texture:
         """A texture from a bitmap. Unless `colors`, its luminance is used."""
         self.rest(item, name)
         path, decoded = _file(item, name), not _flag(item, "raw", False, name)
@@ -375,7 +377,7 @@ def _roughness_and_anisotropy(along: float, across: float) -> dict[str, float]:
     return {"roughness": math.sqrt(across), "anisotropy": math.sqrt(max(square, 0.0))}
 
 
-def read(scene: Mapping[str, Any]) -> Scene:
+def read(scene: Plugin) -> Scene:
     """Reads the scene of a dictionary, as `load_scene` documents.
 
     It may refer to files in any folder: unlike a scene file, a dictionary is written by the caller.
@@ -408,7 +410,7 @@ def read(scene: Mapping[str, Any]) -> Scene:
     return Scene(parts, cameras, lights)
 
 
-def transform(value: Any, name: str, *, sizes: tuple[int, ...] = (4,)) -> np.ndarray:
+def transform(value: object, name: str, *, sizes: tuple[int, ...] = (4,)) -> np.ndarray:
     """A transform, [4 4] or of another size, from an array, lists or an object with a `matrix`; None: the identity."""
     if value is None:
         return np.eye(4)
@@ -431,7 +433,7 @@ def _rotation(matrix: np.ndarray, name: str) -> np.ndarray:
     return turned
 
 
-def _part(name: str, item: Mapping[str, Any], materials: MaterialMaker) -> Part:
+def _part(name: str, item: Plugin, materials: MaterialMaker) -> Part:
     """A shape with its material."""
     kind = item["type"]
     path = pathlib.Path(name)
@@ -479,14 +481,14 @@ def _grid(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return u.reshape(-1, 1), v.reshape(-1, 1), grid_face(rows=rows + 1, columns=columns + 1)[:, ::-1]
 
 
-def _rectangle(name: str, item: Mapping[str, Any]) -> Geometry:
+def _rectangle(name: str, item: Plugin) -> Geometry:
     """A rectangle from -1 to 1 in the plane z = 0, facing +z. As in Mitsuba, the image's first row is at the bottom."""
     u, v, face = _grid(_CELLS, _CELLS)
     position = np.concatenate([2 * u - 1, 2 * v - 1, 0 * u], 1)
     return Geometry(position, face, np.tile([0.0, 0, 1], (len(u), 1)), texture=np.concatenate([u, 1 - v], 1))
 
 
-def _cube(name: str, item: Mapping[str, Any]) -> Geometry:
+def _cube(name: str, item: Plugin) -> Geometry:
     """A cube from -1 to 1 along all axes."""
     u, v, face = _grid(_CELLS, _CELLS)
     position, normal, texture, faces = [], [], [], []
@@ -499,7 +501,7 @@ def _cube(name: str, item: Mapping[str, Any]) -> Geometry:
     return Geometry(*(np.concatenate(rows) for rows in (position, faces, normal)), texture=np.concatenate(texture))
 
 
-def _sphere(name: str, item: Mapping[str, Any]) -> Geometry:
+def _sphere(name: str, item: Plugin) -> Geometry:
     """A sphere around a center. The pole of its texture coordinates is at +z."""
     u, v, face = _grid(_RINGS, 2 * _RINGS)
     sine = np.sin(np.pi * v)
@@ -511,11 +513,11 @@ def _sphere(name: str, item: Mapping[str, Any]) -> Geometry:
     return Geometry(center + radius * normal, face, normal, texture=np.concatenate([u, 1 - v], 1))
 
 
-def _camera(name: str, item: Mapping[str, Any], materials: MaterialMaker, ignored: set[str]) -> Camera:
+def _camera(name: str, item: Plugin, materials: MaterialMaker, ignored: set[str]) -> Camera:
     """A camera from a perspective sensor, which looks along its +z axis."""
     if item["type"] == "thinlens":
         ignored.add(f"the aperture of {name}")
-    film: Mapping[str, Any] = {}
+    film: Plugin = {}
     for key, plugin in materials.plugins(item, name).items():
         if "film" in plugin["type"]:
             if film:
@@ -543,7 +545,7 @@ def _camera(name: str, item: Mapping[str, Any], materials: MaterialMaker, ignore
         raise ValueError(f"{name}: {error}") from error
 
 
-def _environment(name: str, item: Mapping[str, Any]) -> Environment:
+def _environment(name: str, item: Plugin) -> Environment:
     """Distant light from an emitter."""
     turned = transform(item.get("to_world"), f"to_world of {name}")
     if item["type"] == "constant":

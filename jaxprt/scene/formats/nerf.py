@@ -19,6 +19,7 @@ from jaxtyping import Float
 
 from jaxprt import require
 from jaxprt.files import inputs
+from jaxprt.files.inputs import JsonObject
 from jaxprt.scene.camera import Camera
 
 _WORLD = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # from jaxprt's axes to those of the files
@@ -65,7 +66,7 @@ def horizontal_angle(camera: Camera) -> float:
     return 2 * math.atan(math.tan(float(camera.field_of_view) / 2) * camera.width / camera.height)
 
 
-def content(cameras: Sequence[Camera], frames: Sequence[dict[str, Any]], index: Sequence[int]) -> dict[str, Any]:
+def content(cameras: Sequence[Camera], frames: Sequence[JsonObject], index: Sequence[int]) -> JsonObject:
     """What `transforms.json` holds of frames.
 
     Args:
@@ -118,16 +119,16 @@ def load(path: str | os.PathLike, *, width: int | None = None) -> list[Camera]:
     return cameras
 
 
-def _without_null(fields: dict[str, Any]) -> dict[str, Any]:
+def _without_null(fields: JsonObject) -> JsonObject:
     return {key: value for key, value in fields.items() if value is not None}
 
 
-def _is_zero(value: Any) -> bool:
+def _is_zero(value: object) -> bool:
     """Whether a value is false, zero or empty, or a list of such values."""
     return not (any(value) if isinstance(value, list) else value)
 
 
-def _unread(fields: dict[str, Any]) -> set[str]:
+def _unread(fields: JsonObject) -> set[str]:
     """Names of fields that are neither read nor harmless."""
     return {
         key[:80]
@@ -139,7 +140,7 @@ def _unread(fields: dict[str, Any]) -> set[str]:
     }
 
 
-def _camera(what: str, file: dict[str, Any], frame: dict[str, Any], width: int | None) -> Camera:
+def _camera(what: str, file: JsonObject, frame: JsonObject, width: int | None) -> Camera:
     value = file | frame
     _check_pinhole(what, value)
     size = _size(what, value)
@@ -187,11 +188,11 @@ def _axes_and_position(what: str, rows: Any) -> tuple[Float[np.ndarray, "3 3"], 
     return axes, turn[:3, 3]
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: object) -> bool:
     return not isinstance(value, bool) and isinstance(value, int | float) and abs(value) <= require.LARGEST
 
 
-def _number(what: str, fields: dict[str, Any], key: str) -> float | None:
+def _number(what: str, fields: JsonObject, key: str) -> float | None:
     number = fields.get(key)
     if number is None:
         return None
@@ -200,7 +201,7 @@ def _number(what: str, fields: dict[str, Any], key: str) -> float | None:
     return float(number)
 
 
-def _size(what: str, value: dict[str, Any]) -> tuple[int, int] | None:
+def _size(what: str, value: JsonObject) -> tuple[int, int] | None:
     """Width and height of the pictures in pixels; None if the file has none."""
     size = [_number(what, value, key) for key in ("w", "h")]
     for key, number in zip(("w", "h"), size, strict=True):
@@ -214,7 +215,7 @@ def _size(what: str, value: dict[str, Any]) -> tuple[int, int] | None:
     return int(wide), int(high)
 
 
-def _focal_length(what: str, frame: dict[str, Any], file: dict[str, Any], size: tuple[int, int] | None) -> float:
+def _focal_length(what: str, frame: JsonObject, file: JsonObject, size: tuple[int, int] | None) -> float:
     """Focal length in pixels, or in widths of a square picture if its size is not known."""
     level = frame if frame.keys() & _AXIS.keys() else file
     lengths = {}
@@ -237,7 +238,7 @@ def _focal_length(what: str, frame: dict[str, Any], file: dict[str, Any], size: 
     return next(iter(lengths.values()))
 
 
-def _check_pinhole(what: str, value: dict[str, Any]) -> None:
+def _check_pinhole(what: str, value: JsonObject) -> None:
     """Refuses lenses that are none of a pinhole, and axes of other conventions."""
     for key, names in _NAMES.items():
         if key in value and (not isinstance(value[key], str) or value[key].upper() not in names):

@@ -16,8 +16,10 @@ from jaxprt.files import inputs
 from jaxprt.scene.formats import geometry, text
 from jaxprt.scene.formats.file_parts import TextureImages
 from jaxprt.scene.formats.geometry import Geometry, MeshContent, split_corners
-from jaxprt.scene.material import Texture, TexturedMaterial
+from jaxprt.scene.material import Fields, Texture, TexturedMaterial
 from jaxprt.scene.mesh import CLEAR
+
+Values = dict[str, Any]  # numbers and colors of a material, by keyword
 
 _WHITE = re.compile(r"[ \t]+")
 _COMMENT = re.compile(r"^#.*|\s#(\s.*)?$")  # names may contain a #, such as Blender's "Material_#25"
@@ -458,7 +460,7 @@ def _material(
         if np.max(value[key]) > 1:
             ignored.add(f"{key} above 1")
             value[key] = np.minimum(value[key], 1)
-    field: dict[str, Any] = {}
+    field: Fields = {}
     for key, words in statements.items():
         if key in _BUMPS and "norm" in statements:
             ignored.add(f"{key} beside norm")
@@ -500,7 +502,7 @@ def _material(
 
 def _opacity(
     statements: dict[str, list[str]], path: pathlib.Path, name: str, ignored: set[str], image: Texture | None
-) -> dict[str, Any]:
+) -> Fields:
     """The opacity of a material: d, or 1 - Tr without d. An opaque material without map_d has none."""
     alpha = 1.0
     key = "d" if "d" in statements else "Tr"
@@ -523,7 +525,7 @@ def _opacity(
     return {"alpha": alpha, "alpha_mode": "blend"}
 
 
-def _layers(value: dict[str, Any], ignored: set[str]) -> dict[str, Any]:
+def _layers(value: Values, ignored: set[str]) -> Fields:
     """The clear coat and the sheen of a material."""
     if value.get("aniso"):
         ignored.add("aniso")
@@ -536,7 +538,7 @@ def _layers(value: dict[str, Any], ignored: set[str]) -> dict[str, Any]:
     return field | {"sheen_color": value["Ps"], "sheen_roughness": _SHEEN}
 
 
-def _unread_light(statements: dict[str, list[str]], value: dict[str, Any], transparent: bool) -> set[str]:
+def _unread_light(statements: dict[str, list[str]], value: Values, transparent: bool) -> set[str]:
     """What passes through a surface and is not read: refraction, and its color."""
     model, ignored = value.get("illum", 2), set()
     # With `transparent`, illum 4 to 9 only say that the surface is transparent, as Blender writes them.
@@ -550,13 +552,13 @@ def _unread_light(statements: dict[str, list[str]], value: dict[str, Any], trans
     return ignored
 
 
-def _principled(value: dict[str, Any], stated: Collection[str], exponent: float) -> dict[str, Any]:
+def _principled(value: Values, stated: Collection[str], exponent: float) -> Fields:
     """Factors of Blender's principled material, from the values that Blender's exporter writes."""
     # Blender's importer uses the same inverse: source/blender/io/wavefront_obj/importer/obj_import_mtl.cc.
     shine = min(max(value.get("Ns", 0.0) / exponent, 0.0), 1.0)
     metallic = min(max(value.get("Ka", 0.0), 0.0), 1.0) if value.get("illum", 2) in (3, 6) else 0.0
     specular = value.get("Ks", np.full(3, 0.5))
-    factor: dict[str, Any] = {
+    factor: Fields = {
         "roughness": value.get("Pr", 1 - math.sqrt(shine)),
         "metallic": value.get("Pm", metallic),
         "specular": float(np.max(specular) > 0),
@@ -567,7 +569,7 @@ def _principled(value: dict[str, Any], stated: Collection[str], exponent: float)
     }
 
 
-def _make_material(field: dict[str, Any], path: pathlib.Path, name: str) -> TexturedMaterial:
+def _make_material(field: Fields, path: pathlib.Path, name: str) -> TexturedMaterial:
     """Makes the material. Errors name the file and the material."""
     try:
         with np.errstate(over="ignore"):  # materials refuse what is not finite
@@ -597,7 +599,7 @@ def _number(statements: dict[str, list[str]], key: str, path: pathlib.Path, name
 
 
 def _add_map(
-    field: dict[str, Any],
+    field: Fields,
     key: str,
     options: dict[str, list[str]],
     file: pathlib.Path,

@@ -50,7 +50,7 @@ def load_mesh(path: str | pathlib.Path, *, groups: bool = False) -> Mesh:
     return from_file(mesh_file.read(path, groups=groups), path)
 
 
-def _path(value: Any) -> None:
+def _path(value: object) -> None:
     if not isinstance(value, Mapping):
         require.path("path", value)
 
@@ -62,7 +62,7 @@ def _time(value: Any) -> float | None:
     return float(value)
 
 
-def _animation(value: Any) -> None:
+def _animation(value: object) -> None:
     if value is not None and not isinstance(value, str):
         require.count("animation", value)
 

@@ -214,9 +214,7 @@ class FunctionWeights(eqx.Module):
 def _weights(sent: FunctionWeights, blend: Blend) -> Array:
     if not sent.knot:
         return jnp.einsum("kp,vkc->vpc", sent.factor[0], blend.weight, precision="highest")
-    pairs = zip(sent.knot, blend.parameter, strict=True)
-    axis = [grid.neighbors(grid.place(knot, parameter), size=len(knot)) for knot, parameter in pairs]
-    between = [((low, 1 - upper), (low + 1, upper)) for low, upper in axis]
+    between = [((low, 1 - upper), (low + 1, upper)) for low, upper in grid.among(sent.knot, blend.parameter)]
     total: Array | float = 0.0
     for corner in itertools.product(*between):
         share = jnp.asarray(math.prod(part for _, part in corner))

@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Float16
 
 from jaxprt import visibility
 from jaxprt.compile import jit, shared_size
-from jaxprt.files.arrays import Layout, sketch
+from jaxprt.files.arrays import Header, Layout, sketch
 from jaxprt.sphere import cubemap, haar
 from jaxprt.systems.bounces import gather
 from jaxprt.systems.separable import SeparableBrdf, clustered
@@ -38,7 +38,7 @@ class ResponseJob(visibility.rays.VisibilityJob):
     edge: int
 
     @property
-    def header(self) -> Mapping[str, Any]:
+    def header(self) -> Header:
         """What the result depends on."""
         return self.made_by("response", ALGORITHM, edge=self.edge, maps=self.basis.coordinates.__name__)
 
@@ -121,7 +121,7 @@ class _PathJob(members.ClusterJob, visibility.rays.VisibilityJob):
         return result
 
     @property
-    def header(self) -> Mapping[str, Any]:
+    def header(self) -> Header:
         """What the result depends on."""
         maps = [self.bases[number].coordinates.__name__ for number in self.basis]
         divided = visibility.blocks.fingerprint(*(np.asarray(index, np.int64) for index in (self.region, self.member)))
@@ -330,7 +330,7 @@ class AgainJob(_PathJob):
         return np.tile(self.white[self.function], self.texels)
 
     @property
-    def header(self) -> Mapping[str, Any]:
+    def header(self) -> Header:
         """What the result depends on."""
         return {**super().header, "function": self.function.tolist()}
 

@@ -16,7 +16,7 @@ surfaces.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Float16, Int
 
 from jaxprt import visibility
 from jaxprt.decompose import clustering
-from jaxprt.files.arrays import Layout
+from jaxprt.files.arrays import Header, Layout
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.mesh import Mesh, areas
 from jaxprt.sphere import cubemap
@@ -178,7 +178,7 @@ class PatchJob(visibility.rays.VisibilityJob):
     algorithm: ClassVar[dict[str, int]] = {"visibility": visibility.rays.ALGORITHM, "patches": 1}
 
     @property
-    def header(self) -> dict[str, Any]:
+    def header(self) -> Header:
         """What the result depends on."""
         patch = visibility.blocks.fingerprint(np.asarray(self.patch, np.int64))
         return self.made_by("patches", self.algorithm, patch=patch, edge=self.edge)

@@ -176,13 +176,12 @@ def collect(
     clusters, colors, components, harmonic = sent.shape
     rows = row @ jnp.moveaxis(sent, 2, 1).reshape(clusters, components, colors * harmonic)
     whole = rows.reshape(-1, colors, harmonic)[tensor.place].transpose(2, 1, 0)
-    no_more = tensor.patches is None or twice is None or tensor.patches.bounces == 2
-    if matte is None or (change is None and no_more):
+    patches = tensor.patches
+    if patches is None or matte is None or (change is None and (twice is None or patches.bounces == 2)):
         return whole
-    assert tensor.patches is not None
-    mean = tensor.patches.albedo(tensor.function, weight)
-    off = None if change is None else tensor.patches.means(change, tensor.area)
-    return whole + tensor.patches.arriving(mean, off, matte, once, twice)
+    mean = patches.albedo(tensor.function, weight)
+    off = None if change is None else patches.means(change, tensor.area)
+    return whole + patches.arriving(mean, off, matte, once, twice)
 
 
 def _beside(first: Float[Array, "g c n s"], second: Float[Array, "g d m s"]) -> Float[Array, "g e _ s"]:

@@ -107,10 +107,7 @@ class DynamicBrdf(eqx.Module):
         if not self.terms:
             return jnp.zeros((0, self.channels, len(parameter[0])), self.factor.dtype)
         rows = jnp.moveaxis(self.factor.reshape(*self.factor.shape[:-2], -1), -1, 0)
-        axis = [
-            grid.neighbors(grid.place(knot, value), size=len(knot))
-            for knot, value in zip(self.knot, parameter, strict=True)
-        ]
+        axis = grid.among(self.knot, parameter)
         return jnp.swapaxes(grid.read(rows, axis).reshape(self.channels, -1, len(parameter[0])), 0, 1)
 
     def at(self, *parameter: Float[Array, ""]) -> "DynamicBrdf":
@@ -167,13 +164,12 @@ def tabulate(
     grid.check_family(brdf, knot)
     if ranks is not None and (len(ranks) != 3 or not all(isinstance(rank, int) and rank >= 1 for rank in ranks)):
         raise ValueError(f"ranks must be three whole numbers of at least 1, got {ranks}")
-    if lobes == 0 and ranks is None:
-        raise ValueError("a BRDF needs lobes, or ranks of a tensor, or both; got neither")
     table = lobes if isinstance(lobes, LobeBrdf) else None
     if isinstance(lobes, int) and lobes:
         table = lobe_system.tabulate(brdf, lobes=lobes, knot=knot)
     if ranks is None:
-        assert table is not None
+        if table is None:
+            raise ValueError("a BRDF needs lobes, or ranks of a tensor, or both; got neither")
         return without_tensor(table)
     knots, size = grid.check_knots(knot), [len(values) for values in knot]
     places = np.stack(np.meshgrid(*knots, indexing="ij"), -1).reshape(-1, len(knots)) if knots else ()

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxprt.files.inputs import JsonObject
 from jaxprt.sphere import harmonics
 from jaxprt.systems.harmonic.table import HarmonicBrdf
 from jaxprt.systems.harmonic.transfer import TransferMatrix, from_visibility, to_visibility
@@ -63,7 +64,7 @@ class ExportedMatrices(Exported):
         return harmonics.degree_of(len(self.visible)) // 2
 
     @property
-    def description(self) -> dict[str, Any]:
+    def description(self) -> JsonObject:
         """Numbers by which the page's module reads the visibility and the table."""
         visible = {"bands": self.degree + 1, "words": -(-len(self.visible) // 4)}
         return super().description | visible | {"steps": self.brdf.steps, "laplacian": float(self.system.laplacian)}

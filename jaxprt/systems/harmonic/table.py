@@ -104,10 +104,7 @@ class HarmonicBrdf(eqx.Module):
         else:
             spot = hemisphere.parabolic_coordinates(wo) * resolution - 0.5
             place = [spot[:, 1], spot[:, 0]]
-        axis = [
-            grid.neighbors(grid.place(knot, value), size=len(knot))
-            for knot, value in zip(self.knot, parameter, strict=True)
-        ] + [grid.neighbors(coordinate, size=resolution) for coordinate in place]
+        axis = grid.among(self.knot, parameter) + [grid.neighbors(spot, size=resolution) for spot in place]
         value = grid.read(self.table.reshape(-1, *self.table.shape[2:]), axis) * (wo[:, 2] > 0)
         value = value.reshape(*self.table.shape[:2], len(wo))
         return rotation.about_z(value, wo[:, 0] / sin_o, wo[:, 1] / sin_o) if self.isotropic else value

@@ -8,7 +8,6 @@ the same for an ideal diffuse surface of albedo 1: its dot product with the ligh
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,7 +17,7 @@ from jaxtyping import Array, Float, UInt8
 
 from jaxprt import require, visibility
 from jaxprt.compile import jit
-from jaxprt.files.arrays import Layout
+from jaxprt.files.arrays import Header, Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar, harmonics, rotation
 from jaxprt.visibility.blocks import Run
@@ -272,7 +271,7 @@ class _Job(visibility.rays.VisibilityJob):
     diffuse: bool
 
     @property
-    def header(self) -> Mapping[str, Any]:
+    def header(self) -> Header:
         return self.made_by("harmonic diffuse" if self.diffuse else "harmonic", ALGORITHM, degree=self.degree)
 
     @property

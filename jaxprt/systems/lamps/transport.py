@@ -13,7 +13,7 @@ surfaces show the lamp's shape.
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxprt import require, visibility
-from jaxprt.files.arrays import Layout, sketch
+from jaxprt.files.arrays import Header, Layout, sketch
 from jaxprt.scene import origin as origins
 from jaxprt.scene.mesh import Mesh, relative
 from jaxprt.scene.scene import PointLight
@@ -214,7 +214,7 @@ class _Job(visibility.rays.VisibilityJob):
     fine: _Samples
 
     @property
-    def header(self) -> Mapping[str, Any]:
+    def header(self) -> Header:
         """Settings that the result depends on."""
         return self.made_by("lamps", ALGORITHM, pieces=self.coarse.piece.tolist())
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
+from jaxprt.files.inputs import JsonObject
 from jaxprt.scene.points import VERTICES
 from jaxprt.systems.lobe import pyramid
 from jaxprt.systems.lobe.pyramid import LobeTransport, Scales
@@ -78,7 +79,7 @@ class ExportedLobes(Exported):
         return np.ascontiguousarray(np.asarray(self.system.transport.pyramid)[:, self.scales.start[self.level] :])
 
     @property
-    def description(self) -> dict[str, Any]:
+    def description(self) -> JsonObject:
         """Numbers by which the page's module reads the table."""
         return super().description | lobe_description(self.brdf)
 
@@ -113,7 +114,7 @@ class ExportedLobes(Exported):
         return self.system.coarse(CoarseTransport(old.pyramid, vector, *places, old.size, spread))
 
 
-def lobe_description(brdf: LobeBrdf) -> dict[str, Any]:
+def lobe_description(brdf: LobeBrdf) -> JsonObject:
     """Numbers by which the page's module reads a table of lobes."""
     return {"lobes": brdf.lobes, "steps": float(brdf.weight.shape[-1] - 1)}
 

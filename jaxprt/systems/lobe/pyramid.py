@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial, reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int, UInt8
 
 from jaxprt import require, visibility
 from jaxprt.compile import isolated, jit
-from jaxprt.files.arrays import Layout
+from jaxprt.files.arrays import Header, Layout
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.points import VERTICES, Points
 from jaxprt.sphere import cubemap, haar
@@ -447,7 +447,7 @@ class _Job(visibility.rays.VisibilityJob):
     """Job that computes blocks of pyramids; see `blocks.Job`."""
 
     @property
-    def header(self) -> Mapping[str, Any]:
+    def header(self) -> Header:
         return self.made_by("lobe", ALGORITHM)
 
     @property

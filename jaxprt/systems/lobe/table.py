@@ -10,7 +10,7 @@ stands in `benchmarks/published/lobes.py`.
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -122,8 +122,7 @@ class LobeBrdf(eqx.Module):
             needed = f"{len(self.knot)} parameters, got {len(parameter)}"
             raise ValueError(f"the table needs {needed}; a system takes them in its materials, as `Blend.parameter`")
         result = self
-        for knot, value in zip(self.knot, parameter, strict=True):
-            low, upper = grid.neighbors(grid.place(knot, value), size=len(knot))
+        for knot, (low, upper) in zip(self.knot, grid.among(self.knot, parameter), strict=True):
             result = _mean(result, jnp.zeros_like(knot).at[low].set(1 - upper).at[low + 1].set(upper))
         return result
 
@@ -154,10 +153,7 @@ class LobeBrdf(eqx.Module):
             axis = [grid.neighbors(spot[:, i], size=resolution) for i in (1, 0)]
         nodes = self.scale.shape[1:]
         rows = [array.reshape(-1, *nodes) for array in (self.mean, self.scale, self.weight, self.diffuse)]
-        place = [
-            grid.neighbors(grid.place(knot, value), size=len(knot))
-            for knot, value in zip(self.knot, parameter, strict=True)
-        ]
+        place = grid.among(self.knot, parameter)
         if place:
             entry = _entries_between(jnp.concatenate(rows), place, axis, lobes=self.lobes)
             mean, scale, strength, diffuse = (jnp.moveaxis(column, 0, -1) for column in entry)
@@ -455,16 +451,15 @@ def _entries_between(row: Float[Array, "r *q"], knot: list, axis: list, *, lobes
 @partial(isolated, static=("lobes",))
 def _interpolate(read: tuple[Array, ...], upper: tuple[Array, ...], share: tuple[Array, ...], *, lobes: int) -> _Entry:
     """Entries at all knots and nodes, interpolated: `upper` between knots, and in the given shares between nodes."""
-    entry, knots, total = [_entry(row, lobes=lobes) for row in read], 1 << len(upper), None
+    entry, knots, parts = [_entry(row, lobes=lobes) for row in read], 1 << len(upper), []
     for node, part in enumerate(share):
         at_knots = entry[node * knots : (node + 1) * knots]
         for weight in reversed(upper):
             pairs = zip(at_knots[::2], at_knots[1::2], strict=True)
             at_knots = [_between_knots(low, high, weight) for low, high in pairs]
-        scaled = jax.tree.map(lambda value, part=part: value * part.reshape(-1, *[1] * (value.ndim - 1)), at_knots[0])
-        total = scaled if total is None else jax.tree.map(jnp.add, total, scaled)
-    assert total is not None
-    return total
+        shares = jax.tree.map(lambda value, part=part: value * part.reshape(-1, *[1] * (value.ndim - 1)), at_knots[0])
+        parts.append(shares)
+    return reduce(partial(jax.tree.map, jnp.add), parts)
 
 
 @isolated

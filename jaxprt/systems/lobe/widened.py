@@ -75,8 +75,6 @@ def combine(system: Any, light: PyTree, seen: WidenedView, points: Points) -> Fl
     """
     if not isinstance(light, BrightLight):
         return system.combine(light, seen.rest, points)
-    assert isinstance(system, BrightTexels)
-    assert light.seen is not None
     size = system.visibility.size
     direction, area = (
         quantity(size=size).reshape(-1, 3)[light.texel] for quantity in (cubemap.direction, cubemap.vector_area)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Float16, Int, UInt, UInt8
 from jaxprt import require, visibility
 from jaxprt.compile import jit, linear, mapped
 from jaxprt.decompose import eigen
-from jaxprt.files.arrays import Layout, Reference, reference, sketch
+from jaxprt.files.arrays import Header, Layout, Reference, reference, sketch
 from jaxprt.sphere import haar
 from jaxprt.systems.separable import sparse
 from jaxprt.systems.separable.factorization import SeparableBrdf, mark_of
@@ -318,7 +318,7 @@ def _rms(index: Array, mode: Array, core: Array, weight: Array, *, size: int) ->
     return jnp.sqrt(jnp.zeros(size, total.dtype).at[index.astype(jnp.int32)].add(total) / count)
 
 
-def _is_reference(value: Any) -> bool:
+def _is_reference(value: object) -> bool:
     return isinstance(value, Reference)
 
 
@@ -333,7 +333,7 @@ class _Job(members.ClusterJob):
     modes: int
     count: int
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """State for pickling. Memory-mapped visibility is pickled as the name of its file."""
         level = reference(self.direct.level)  # pyright: ignore[reportArgumentType]
         return {**vars(self), "direct": eqx.tree_at(lambda stored: stored.level, self.direct, level)}
@@ -346,7 +346,7 @@ class _Job(members.ClusterJob):
         vars(self).update(state, direct=direct)
 
     @property
-    def header(self) -> Mapping[str, Any]:
+    def header(self) -> Header:
         return {
             "system": "clustered",
             "algorithm": ALGORITHM,

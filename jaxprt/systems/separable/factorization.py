@@ -188,7 +188,7 @@ def factor(
     _check_terms(1 if terms is None else terms, inside.size)
     table = tabulate(brdf, jnp.asarray(direction))
     flux, matrix, covariance = _matrices(table, direction, solid_angle, inside)
-    value, vector, remainder, terms = _leading(matrix, covariance, terms, error)
+    value, vector, remainder, terms = _leading(matrix, covariance, terms, error or 0.0)
     light_map, view_map = _maps(table, solid_angle, flux, matrix, covariance, value, vector)
     # Fix the signs and the order of coinciding terms, so that transport from another machine fits the factors made
     # here.
@@ -379,9 +379,7 @@ def light_covariance(direction: Float[Array, "d 3"], *, degree: int) -> Float[Ar
     return total
 
 
-def _leading(
-    matrix: Array, covariance: Array, terms: int | None, error: float | None
-) -> tuple[Array, Array, np.ndarray, int]:
+def _leading(matrix: Array, covariance: Array, terms: int | None, error: float) -> tuple[Array, Array, np.ndarray, int]:
     """Squared singular values, singular vectors, errors by number of terms; `terms` or the least that meet `error`."""
     total = _total(matrix, covariance)
     most = min(_MOST_TERMS, matrix.shape[1])
@@ -392,7 +390,6 @@ def _leading(
         remainder = np.asarray(_remainder(value, total))
         if terms is not None:
             return value, vector, remainder, terms
-        assert error is not None
         reached = np.flatnonzero(remainder <= error)
         if reached.size:
             return value, vector, remainder, int(reached[0]) + 1

@@ -3,10 +3,10 @@
 The largest coefficients of each vertex and term are stored, padded to rows of equal length.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int, Shaped, UInt, UInt8
 
 from jaxprt import require, visibility
 from jaxprt.compile import jit, linear, total
-from jaxprt.files.arrays import Layout, sketch
+from jaxprt.files.arrays import Header, Layout, sketch
 from jaxprt.scene.mesh import Mesh
 from jaxprt.sphere import cubemap, directions, haar
 from jaxprt.systems.separable.factorization import SeparableBrdf, mark_of
@@ -114,8 +114,8 @@ class SparseTransport(eqx.Module):
         colors = max(coefficient.shape[1], self.value.shape[3])
         coefficient = jnp.broadcast_to(coefficient, (len(coefficient), colors))
         if self.transpose is None:
-            return _gather(self, coefficient)
-        return linear(_gather, _scatter, self, coefficient)
+            return _gather((self, None), coefficient)
+        return linear(_gather, _scatter, (dataclasses.replace(self, transpose=None), self.transpose), coefficient)
 
     @property
     def terms(self) -> int:
@@ -128,16 +128,16 @@ class SparseTransport(eqx.Module):
         return self.index.nbytes + self.value.nbytes + sum(array.nbytes for array in jax.tree.leaves(self.transpose))
 
 
-def _gather(transport: SparseTransport, coefficient: Array) -> Array:
+def _gather(fixed: tuple[SparseTransport, Transpose | None], coefficient: Array) -> Array:
     """`apply`. The axis of kept coefficients comes first, so that each step reads contiguous rows of all vertices."""
+    transport, _ = fixed
     keep, vertices, terms = transport.index.shape
     rows = transport.index.reshape(keep, -1), transport.value.reshape(keep, vertices * terms, -1)
     return _accumulate(*rows, coefficient).reshape(vertices, terms, -1)
 
 
-def _scatter(transport: SparseTransport, cotangent: Array) -> Array:
-    assert transport.transpose is not None
-    transpose = transport.transpose
+def _scatter(fixed: tuple[SparseTransport, Transpose], cotangent: Array) -> Array:
+    transport, transpose = fixed
     chunk = _accumulate(transpose.row, transpose.value, cotangent.reshape(-1, cotangent.shape[-1]))
     start = jnp.zeros((len(transport.rms), chunk.shape[1]), chunk.dtype)
     return start.at[transpose.number].add(chunk, indices_are_sorted=True)
@@ -316,7 +316,7 @@ class _Job(visibility.rays.VisibilityJob):
     keep: int
 
     @property
-    def header(self) -> Mapping[str, Any]:
+    def header(self) -> Header:
         return self.made_by("separable", ALGORITHM, maps=self.brdf.coordinates.__name__, keep=self.keep)
 
     @property

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
 from jaxprt import require
@@ -193,7 +194,7 @@ def _cosine(tangent: np.ndarray) -> np.ndarray:
     return (1 - tangent**2) / (1 + tangent**2)
 
 
-def _over(base: Any, layer: Any, axis: int) -> np.ndarray:
+def _over(base: ArrayLike, layer: ArrayLike, axis: int) -> np.ndarray:
     """Entries [... n v] of the base over the second parameter, and of the layer [... m v] over the first."""
     base, layer = np.asarray(base), np.asarray(layer)
     shape = (base.shape[-2], layer.shape[-2], base.shape[-1])
@@ -201,19 +202,19 @@ def _over(base: Any, layer: Any, axis: int) -> np.ndarray:
     return np.concatenate([rows, np.broadcast_to(layer[..., None, :, :], (*layer.shape[:-2], *shape))], axis)
 
 
-def _under(base: Any, layer: Any, loss: np.ndarray) -> np.ndarray:
+def _under(base: ArrayLike, layer: ArrayLike, loss: np.ndarray) -> np.ndarray:
     """Channels [k ... n v] of the base, these under a full layer, and that of the layer [1 ... m v]."""
     whole = _over(base, layer, 0)
     return np.concatenate([whole[:-1], whole[:-1] * (1 - loss), whole[-1:]])
 
 
 @functools.cache
-def _lobes(over: str, count: int, dtype: Any) -> LobeBrdf:
+def _lobes(over: str, count: int, dtype: DTypeLike) -> LobeBrdf:
     return _layered_lobes(_LAYERS[over], METALLIC_ROUGHNESS.lobes(count), _LAYERS[over].table.lobes(count), dtype)
 
 
 @functools.cache
-def _tensor(over: str, count: int, ranks: tuple[int, int, int] | None, dtype: Any) -> DynamicBrdf:
+def _tensor(over: str, count: int, ranks: tuple[int, int, int] | None, dtype: DTypeLike) -> DynamicBrdf:
     layer = _LAYERS[over]
     base = METALLIC_ROUGHNESS.tensor(count, ranks)
     lobes, factor = _layered_lobes(layer, base.lobe, layer.table.lobes(count), dtype), np.asarray(base.factor)
@@ -225,7 +226,7 @@ def _tensor(over: str, count: int, ranks: tuple[int, int, int] | None, dtype: An
     return DynamicBrdf(lobes, base.core, whole, base.view_map, base.light_map, base.error)
 
 
-def _layered_lobes(layer: _Layer, base: LobeBrdf, top: LobeBrdf, dtype: Any) -> LobeBrdf:
+def _layered_lobes(layer: _Layer, base: LobeBrdf, top: LobeBrdf, dtype: DTypeLike) -> LobeBrdf:
     """The lobes of the base, and those of the layer."""
     cosine = _cosine(np.linspace(0, 1, base.scale.shape[-1]))
     loss = layer.loss(cosine, layer.table.knot)
@@ -250,7 +251,7 @@ def _layered_lobes(layer: _Layer, base: LobeBrdf, top: LobeBrdf, dtype: Any) -> 
 
 
 @functools.cache
-def _harmonics(over: str, degree: int, dtype: Any) -> HarmonicBrdf:
+def _harmonics(over: str, degree: int, dtype: DTypeLike) -> HarmonicBrdf:
     layer = _LAYERS[over]
     base, top = METALLIC_ROUGHNESS.harmonics(degree), layer.table.harmonics(degree)
     cosine, knot = _cosine(np.arange(base.table.shape[-1]) / base.steps), np.asarray(top.knot[0], np.float64)
@@ -265,7 +266,7 @@ def _harmonics(over: str, degree: int, dtype: Any) -> HarmonicBrdf:
 
 
 @functools.cache
-def _paths(over: str, dtype: Any) -> tuple[SeparableBrdf, FunctionWeights]:
+def _paths(over: str, dtype: DTypeLike) -> tuple[SeparableBrdf, FunctionWeights]:
     layer = _LAYERS[over]
     brdf, path = METALLIC_ROUGHNESS.paths()
     factor, knot = np.asarray(path.factor), layer.table.knot

@@ -9,11 +9,11 @@ import functools
 import pathlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from jaxprt import require
@@ -141,14 +141,9 @@ class StandardTable:
         """
         return _tensor(self, int(lobes), None if ranks is None else tuple(ranks), _dtype())
 
-    @property
-    def has_paths(self) -> bool:
-        """Whether the functions of light paths are shipped."""
-        return "path.view" in self._stored
-
     def paths(self) -> tuple[SeparableBrdf, FunctionWeights]:
         """The functions with which parts send light to others, and their weights over roughness."""
-        if not self.has_paths:
+        if "path.view" not in self._stored:
             raise ValueError(f"no functions of light paths are shipped for {self.name}")
         return _paths(self, _dtype())
 
@@ -181,7 +176,8 @@ class StandardTable:
             size: Edge of the cubemap faces in texels.
         """
         knot = self._stored["samples.knot"]
-        place = max(log_roughness, self.range[0]) + np.log(size / TEXELS) / self._power
+        power = 2 if self.name == "metallic_roughness" else 1  # the width of lobes is proportional to that of roughness
+        place = max(log_roughness, self.range[0]) + np.log(size / TEXELS) / power
         return int(self._stored["samples"][max(int(np.searchsorted(knot, place + 1e-6)) - 1, 0)])
 
     def is_sharp(self, log_roughness: float, weight: Float[np.ndarray, " k"] | None = None) -> bool:
@@ -198,11 +194,6 @@ class StandardTable:
         albedo = self._stored["albedo"].astype(np.float64)
         albedo = albedo.sum(2) if weight is None else albedo @ np.asarray(weight, np.float64)
         return np.array([np.interp(log_roughness, self._stored["knot"], row) for row in albedo])
-
-    @property
-    def _power(self) -> int:
-        """Power of the roughness to which the width of lobes is proportional."""
-        return 2 if self.name == "metallic_roughness" else 1
 
     @property
     def _stored(self) -> Mapping[str, np.ndarray]:
@@ -233,7 +224,7 @@ def _read(name: str) -> Mapping[str, np.ndarray]:
 
 
 @functools.cache
-def _lobes(table: StandardTable, count: int, dtype: Any) -> LobeBrdf:
+def _lobes(table: StandardTable, count: int, dtype: DTypeLike) -> LobeBrdf:
     if count not in table.counts:
         with jax.ensure_compile_time_eval():
             return lobe.tabulate(table.family, lobes=count, knot=(np.asarray(table._stored["knot"]),))
@@ -248,7 +239,7 @@ def _lobes(table: StandardTable, count: int, dtype: Any) -> LobeBrdf:
 
 
 @functools.cache
-def _tensor(table: StandardTable, lobes: int, ranks: tuple[int, int, int] | None, dtype: Any) -> DynamicBrdf:
+def _tensor(table: StandardTable, lobes: int, ranks: tuple[int, int, int] | None, dtype: DTypeLike) -> DynamicBrdf:
     if not table.has_tensor(lobes, ranks):
         with jax.ensure_compile_time_eval():
             knot = (np.asarray(table._stored["knot"]),)
@@ -263,7 +254,7 @@ def _tensor(table: StandardTable, lobes: int, ranks: tuple[int, int, int] | None
 
 
 @functools.cache
-def _harmonics(table: StandardTable, degree: int, dtype: Any) -> HarmonicBrdf:
+def _harmonics(table: StandardTable, degree: int, dtype: DTypeLike) -> HarmonicBrdf:
     stored = table._stored
     value = constant(stored["harmonics"][: (degree + 1) ** 2], dtype=dtype)
     return HarmonicBrdf(
@@ -272,18 +263,18 @@ def _harmonics(table: StandardTable, degree: int, dtype: Any) -> HarmonicBrdf:
 
 
 @functools.cache
-def _paths(table: StandardTable, dtype: Any) -> tuple[SeparableBrdf, FunctionWeights]:
+def _paths(table: StandardTable, dtype: DTypeLike) -> tuple[SeparableBrdf, FunctionWeights]:
     names = "light", "view", "factor", "error"
     light, view, factor, error = (constant(table._stored[f"path.{name}"], dtype=dtype) for name in names)
     knot = (constant(table._stored["knot"], dtype=dtype),)
     return SeparableBrdf(light, view, error, hemisphere.parabolic_coordinates), FunctionWeights(knot, factor)
 
 
-def _dtype() -> Any:
+def _dtype() -> DTypeLike:
     return jnp.result_type(float)
 
 
-def constant(value: np.ndarray, *, dtype: Any = None) -> jax.Array:
+def constant(value: np.ndarray, *, dtype: DTypeLike | None = None) -> jax.Array:
     """An array on the device, also while JAX traces a function. No program is compiled."""
     with jax.ensure_compile_time_eval():
         return jax.device_put(np.asarray(value, _dtype() if dtype is None else dtype))
