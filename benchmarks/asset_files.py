@@ -97,6 +97,7 @@ class Surface:
         face: Indices [f 3], counterclockwise seen from the front.
         normal: Unit normals [v 3], or None for flat triangles.
         texture: Texture coordinates [v 2] with v down, by the number of their set.
+        tangent: Unit tangents with the side of the bitangent [v 4] for normal maps; None for those of the texture.
         color: Linear colors and alpha [v 4] that multiply the base color, or None.
         material: The material.
     """
@@ -107,6 +108,7 @@ class Surface:
     texture: dict[int, np.ndarray]
     color: np.ndarray | None
     material: Material
+    tangent: np.ndarray | None = None
 
 
 def read(path: pathlib.Path) -> list[Surface]:
@@ -223,7 +225,12 @@ class GltfFile:
             sign = np.where(np.linalg.det(linear) < 0, -1.0, 1.0)[:, None, None]
             turned = np.broadcast_to(sign * cofactor, (len(position), 3, 3))
             normal = _unit(np.einsum("vij,vj->vi", turned, values["NORMAL"].astype(float)))
-        color = None
+        color = tangent = None
+        if "TANGENT" in values:
+            given = values["TANGENT"].astype(float)
+            way = np.einsum("vij,vj->vi", np.broadcast_to(linear, (len(position), 3, 3)), given[:, :3])
+            side = np.broadcast_to(np.sign(np.linalg.det(linear)), len(position)) * given[:, 3]
+            tangent = np.concatenate([_unit(way), side[:, None]], 1)
         if "COLOR_0" in values:
             given = values["COLOR_0"].astype(float)
             color = np.ones((len(given), 4))
@@ -231,7 +238,7 @@ class GltfFile:
         texture = {int(name[9:]): value for name, value in values.items() if name.startswith("TEXCOORD_")}
         if material not in self._materials:
             self._materials[material] = self._material(material)
-        return Surface(placed, face, normal, texture, color, self._materials[material])
+        return Surface(placed, face, normal, texture, color, self._materials[material], tangent)
 
     def _material(self, index: int | None) -> Material:
         if index is None:
@@ -277,10 +284,11 @@ class GltfFile:
             return None
         info = item[key]
         texture = self.json["textures"][info["index"]]
-        if "source" not in texture:
-            raise UnreadableError("a texture has neither PNG nor JPEG")
+        source = texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source")
+        if source is None:
+            raise UnreadableError("a texture has neither PNG, JPEG nor WebP")
         sampler = self.json["samplers"][texture["sampler"]] if "sampler" in texture else {}
-        image = self._image(texture["source"])
+        image = self._image(source)
         if srgb:
             image = np.concatenate([_linear(image[..., :3]), image[..., 3:]], -1)
         moved = info.get("extensions", {}).get("KHR_texture_transform", {})

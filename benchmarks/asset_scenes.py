@@ -15,7 +15,6 @@ import numpy as np
 
 from benchmarks import path_tracing, plugins
 from benchmarks.asset_files import Map, Material, Surface
-from jaxprt import files
 
 MODELS = "gltf", "principled"
 _HEIGHT = 1024  # rows of the light, about: texels of the file are boxes
@@ -107,7 +106,12 @@ def emitter(mitsuba: Any, path: pathlib.Path) -> dict[str, Any]:
 
     Mitsuba interpolates between texels, and its first and last rows are the poles. Therefore texels are repeated.
     """
-    pixels = np.maximum(np.asarray(files.read_image(str(path))[0], np.float32), 0)
+    import OpenImageIO
+
+    pixels = OpenImageIO.ImageBuf(str(path)).get_pixels(OpenImageIO.FLOAT)
+    if pixels is None:
+        raise ValueError(f"the light must be an image that OpenImageIO reads, got {path}")
+    pixels = np.maximum(pixels, 0)
     if not pixels.any():
         return {}
     pixels = np.repeat(pixels, 3, -1) if pixels.shape[-1] == 1 else pixels[..., :3]
@@ -122,17 +126,20 @@ def emitter(mitsuba: Any, path: pathlib.Path) -> dict[str, Any]:
 
 
 def _sides(surface: Surface) -> list[Surface]:
-    """Triangles whose texture coordinates are mirrored apart from the others, if there is a normal map.
+    """Triangles whose bitangents are mirrored apart from the others, if there is a normal map.
 
     Mitsuba's `normalmap` has the bitangent to the left of the tangent. A mirrored triangle has it to the right, so its
-    map is read with the opposite green.
+    map is read with the opposite green. The file's tangents say which (section 3.7.2.1), or the texture coordinates.
     """
     normal = surface.material.normal_map
     if normal is None or normal.coordinates not in surface.texture:
         return [surface]
-    a, b, c = (surface.texture[normal.coordinates][surface.face[:, corner]].astype(float) for corner in range(3))
-    one, other = b - a, c - a
-    mirrored = one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0] > 0  # v is down
+    if surface.tangent is not None:
+        mirrored = surface.tangent[surface.face[:, 0], 3] < 0
+    else:
+        a, b, c = (surface.texture[normal.coordinates][surface.face[:, corner]].astype(float) for corner in range(3))
+        one, other = b - a, c - a
+        mirrored = one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0] > 0  # v is down
     flipped = dataclasses.replace(normal, image=normal.image[..., :3] * [1, -1, 1] + [0, 1, 0])
     material = dataclasses.replace(surface.material, normal_map=flipped)
     parts = [
@@ -145,7 +152,7 @@ def _sides(surface: Surface) -> list[Surface]:
 def _shape(mitsuba: Any, surface: Surface, model: str, materials: dict[tuple, Any]) -> Any:
     """Mitsuba's mesh with its material, which surfaces share: Dr.Jit traces each of them."""
     material, normal = surface.material, surface.normal
-    key = id(material), surface.color is None, tuple(sorted(surface.texture))
+    key = id(material), surface.color is None, surface.tangent is None, tuple(sorted(surface.texture))
     if key not in materials:
         material_of = _bsdf(mitsuba, surface, model)
         materials[key] = mitsuba.load_dict(material_of) if isinstance(material_of, dict) else material_of
@@ -165,7 +172,7 @@ def _shape(mitsuba: Any, surface: Surface, model: str, materials: dict[tuple, An
         parameters["vertex_normals"] = normal.astype(np.float32).ravel()
     if uv is not None:
         parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
-    attributes = {plugins.TANGENT: np.zeros((count, 3))}
+    attributes = {plugins.TANGENT: np.zeros((count, 3)) if surface.tangent is None else surface.tangent[:, :3]}
     if surface.color is not None:
         attributes |= {_COLOR: surface.color[:, :3], _ALPHA: surface.color[:, 3:]}
     for name, value in attributes.items():
@@ -218,6 +225,8 @@ def _bsdf(mitsuba: Any, surface: Surface, model: str) -> Any:
             "inner": core,
             **options,
         }
+        if surface.tangent is not None:
+            core = plugins.along_tangents(mitsuba.load_dict(core))
     if material.double_sided:
         core = {"type": "twosided", "inner": core}
     if not material.opaque:

@@ -7,23 +7,27 @@
 Every file is relit by README's lines, with their defaults, in a process of its own with a time limit. It starts without
 compiled programs, unless `--warm` is given. The judge is Mitsuba in another process: `benchmarks.asset_files` reads the
 file, and `benchmarks.asset_scenes` writes its materials and the environment file down for Mitsuba, none of it with
-jaxprt's code. Only the camera is jaxprt's: the first of the file, or the default one. Light is direct, as it is by
+jaxprt's code; images are decoded by Pillow and the light by OpenImageIO, which jaxprt uses too. Only the camera is
+jaxprt's: the first of the file, or the default one. Light is direct, as it is by
 default; with `--bounces` it is reflected as often as that brings something, 39 times by Mitsuba. With `--dark` it is
 that of the file's lamps alone. `--model principled` judges by Mitsuba's own BSDF in place of the formula of the glTF
 specification.
 
 Each file is one line. `error` is relative L2 over the pixels that surfaces fill, without Mitsuba's noise, the largest
-of the lights; `errors`, `flips`, `biases` and `noises` have all of them. Errors far below the noise, as of glints of a
-sun on smooth metal, are uncertain. `mismatch` is the share of pixels in which the shares that surfaces cover differ by
+of the lights; `errors`, `flips`, `biases` and `noises` have all of them. `judged` is the share of these pixels among
+all that surfaces touch; `whole` is the error of all, with outlines and alpha over a black background. Mitsuba takes
+samples until its noise is below a third of the error, or `BLOCKS` times as many as asked for: glints of a sun on
+smooth metal may stay uncertain. `mismatch` is the share of pixels in which the shares that surfaces cover differ by
 more than a half. `backs` is the share of pixels that show the back of a surface of one side: black here, while glTF's
 viewers see through it. `undefined` is the share of pixels that are left out, because interpolated normals look away
 from the eye. `precompute_seconds` and `picture_seconds` are processor seconds, the first with loading; `seconds` are
 those of the clock from the start of the process to the first picture. `warnings` are jaxprt's. `unjudged` names what
-the judge leaves out of the materials. A file that is not drawn has `refused` (jaxprt's reason) or `unreadable` (the
-judge's), and no error.
+the judge leaves out of the materials, such as a clear coat: `error` then has the judge's fault in it too. A file that
+is not drawn has `refused` (jaxprt's reason) or `unreadable` (the judge's), and no error.
 
-The last line counts files: `valid` can be read by the judge or by jaxprt, `loaded` are drawn, `judged` have errors,
-whose median is `error`; `silent` are those of more than 10 % of which nothing warned.
+The last line counts files: `valid` can be read by the judge or by jaxprt, `loaded` are drawn, `judged` have errors of
+whole materials, whose median is `error`, and `partly` errors of others; `silent` are files of more than 10 % of which
+nothing warned.
 """
 
 import argparse
@@ -48,8 +52,10 @@ import numpy as np
 from benchmarks import asset_files, asset_scenes, denoised, harness
 
 EDGE, SAMPLES = 512, 256
-LIGHTS = "polyhaven_sunrise_1k.exr", "polyhaven_courtyard_1k.exr"  # a sun, and a soft light
-NOISE, BLOCKS = 0.015, 16  # relative L2 of Mitsuba's pictures at which to stop, and so many times the samples at most
+# A sun, an open sky, and soft boxes.
+LIGHTS = "polyhaven_sunrise_1k.exr", "polyhaven_courtyard_1k.exr", "polyhaven_studio_1k.exr"
+BLOCKS = 16  # times the samples of Mitsuba's pictures, at most
+_CERTAIN = 3  # times the noise that an error must be
 BOUNCES = 39  # of Mitsuba, with `--bounces`
 LIMIT = 900.0  # seconds of the clock
 LARGE = 0.1  # error of which something should warn
@@ -61,7 +67,7 @@ def main(options: Sequence[str] | None = None) -> None:
     parser.add_argument("folder", nargs="*", type=pathlib.Path, help="folders or files")
     parser.add_argument("--only", metavar="TEXT", default="", help="files whose paths have TEXT")
     parser.add_argument(
-        "--light", type=pathlib.Path, metavar="FILE", action="append", help="instead of a sun and a soft light"
+        "--light", type=pathlib.Path, metavar="FILE", action="append", help="instead of a sun, a sky and a studio"
     )
     parser.add_argument(
         "--edge", type=int, metavar="N", default=EDGE, help=f"pixels along an edge; {EDGE} if not given"
@@ -183,7 +189,7 @@ def judge(
     line |= {key: ours[key] for key in keys}
     if store is not None:
         store.mkdir(parents=True, exist_ok=True)
-    request |= {"camera": ours["camera"], "store": store and store.absolute()}
+    request |= {"camera": ours["camera"], "pictures": ours["pictures"], "store": store and store.absolute()}
     theirs, reason = in_process("trace", request, folder, warm=True, limit=limit)
     if theirs is None:
         return line | {"unreadable": reason}
@@ -198,7 +204,7 @@ def compared(
     pictures: pathlib.Path | None,
 ) -> dict[str, Any]:
     """What our pictures are off."""
-    rows, columns = [], {name: {} for name in ("errors", "flips", "biases", "noises")}
+    rows, columns = [], {name: {} for name in ("errors", "flips", "biases", "noises", "whole")}
     backs, undefined = theirs["sides"]
     for light, drawn, halves in zip(lights, ours["pictures"], theirs["halves"], strict=True):
         try:
@@ -207,7 +213,8 @@ def compared(
         except ValueError as error:
             return {"unreadable": str(error)}
         row, flip = sheet(drawn, halves.mean(0), truth.inside)
-        figures = truth.error(drawn), flip, truth.bias(drawn), truth.noise
+        whole = denoised.Truth(kept, theirs["samples"], covered=0.0).error(drawn)
+        figures = truth.error(drawn), flip, truth.bias(drawn), truth.noise, whole
         for name, value in zip(columns, figures, strict=True):
             columns[name][light] = round(value, 4)
         rows.append(row)
@@ -217,17 +224,20 @@ def compared(
     mismatch = np.abs(ours["covered"] - theirs["halves"][0].mean(0)[..., 3]) > 0.5
     shares = {"mismatch": mismatch, "backs": backs, "undefined": undefined}
     extra = {name: float(value.mean()) for name, value in shares.items()} | {"unjudged": theirs["unjudged"]}
+    extra["judged"] = float(truth.inside.sum() / (theirs["halves"][-1][..., 3] > 0).all(0).sum())
     return {"error": max(columns["errors"].values()), **columns, **extra}
 
 
 def summary(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The last line."""
-    errors = [line["error"] for line in lines if line["error"] is not None]
+    judged = [line for line in lines if line["error"] is not None]
+    errors = [line["error"] for line in judged if not line.get("unjudged")]
     silent = [line["case"] for line in lines if (line["error"] or 0) > LARGE and not line["warnings"]]
     return {
         **{"benchmark": "assets", "case": "all files", "compile_seconds": None},
         **{"error": statistics.median(errors) if errors else None, "seconds": sum(line["seconds"] for line in lines)},
         **{"bytes": sum(line["bytes"] for line in lines), "files": len(lines), "judged": len(errors)},
+        "partly": len(judged) - len(errors),
         "valid": sum(line["loaded"] or "unreadable" not in line for line in lines),
         "loaded": sum(line["loaded"] for line in lines),
         **{"above": sum(error > LARGE for error in errors), "silent": len(silent), "silent_files": silent},
@@ -236,7 +246,7 @@ def summary(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def table(lines: Sequence[dict[str, Any]], lights: Sequence[str]) -> str:
     """The lines as a table in Markdown."""
-    names = ["file", "vertices", *lights, "FLIP", "precomputation, picture", "warnings"]
+    names = ["file", "vertices", *lights, "whole", "FLIP", "precomputation, picture", "warnings", "not judged"]
     rows = [names, ["---"] * len(names)]
     for line in lines:
         row = [line["case"]]
@@ -244,7 +254,11 @@ def table(lines: Sequence[dict[str, Any]], lights: Sequence[str]) -> str:
             seconds = f"{line['precompute_seconds']:.0f}, {line['picture_seconds']:.0f} s"
             errors = [f"{line['errors'][light]:.1%}" if "errors" in line else "-" for light in lights]
             flip = f"{max(line['flips'].values()):.3f}" if "flips" in line else "-"
-            row += [f"{line['vertices']:,}", *errors, flip, seconds, str(len(line["warnings"]) or "none")]
+            whole = f"{max(line['whole'].values()):.1%}" if "whole" in line else "-"
+            rest = [f"{1 - line['judged']:.0%} of pixels"] if "judged" in line else ["all"]
+            warned = str(len(line["warnings"]) or "none")
+            left_out = ", ".join(rest + line.get("unjudged", []))
+            row += [f"{line['vertices']:,}", *errors, whole, flip, seconds, warned, left_out]
         else:
             row += ["-"] * (len(names) - 2) + [f"refused: {line['refused']}"]
         rows.append([cell.replace("|", "\\|") for cell in row])
@@ -317,9 +331,9 @@ def relight(request: dict[str, Any]) -> dict[str, Any]:
         relit = prt.precompute(scene, system="lobe", path=f"{store}/scene.prt", progress=False, **options)
         precomputed = _processor_seconds()
         camera = dataclasses.replace(relit.camera, width=request["edge"], height=request["edge"])
-        pictures = [np.asarray(relit.picture(lights[0], camera))]
+        pictures = [np.asarray(relit.picture(lights[0], camera, background=None))]
         drawn, seconds = _processor_seconds(), time.time() - request["started"]
-        pictures += [np.asarray(relit.picture(light, camera)) for light in lights[1:]]
+        pictures += [np.asarray(relit.picture(light, camera, background=None)) for light in lights[1:]]
         pixels = image.shading_points(image.rasterize(relit.mesh, camera, samples=4), relit.mesh, camera)
     shown = [warning for warning in raised if issubclass(warning.category, UserWarning)]
     return {
@@ -343,38 +357,54 @@ def trace(request: dict[str, Any]) -> dict[str, Any]:
     """Mitsuba's pictures, two of each light."""
     surfaces = asset_files.read(request["path"])
     halves, sides = [], np.zeros(())
-    for light in request["lights"]:
+    for light, drawn in zip(request["lights"], request["pictures"], strict=True):
         code = "".join(inspect.getsource(module) for module in (asset_files, asset_scenes))
         camera = [np.asarray(value).tolist() for value in vars(request["camera"]).values()]
         asked = [request[name] for name in ("samples", "model", "bounces")]
         what = pickle.dumps((surfaces, light.read_bytes(), camera, asked, code))
         path = request["store"] and request["store"] / f"{hashlib.sha256(what).hexdigest()}.npz"
-        if path is None or not path.is_file():
-            both, sides = _rendered(surfaces, light, request)
-            if path is not None:
-                np.savez(path, both=both, sides=sides)
-        else:
+        known = None
+        if path is not None and path.is_file():
             with np.load(path) as kept:
-                both, sides = kept["both"], kept["sides"]
-        halves.append(both)
+                known = kept["total"], int(kept["blocks"]), kept["sides"]
+        total, blocks, sides = _rendered(surfaces, light, request, drawn, known)
+        if path is not None:
+            np.savez(path, total=total, blocks=blocks, sides=sides)
+        halves.append(total / blocks)
     unjudged = sorted(set().union(*map(asset_scenes.unjudged, surfaces)))
     return {"halves": halves, "samples": 2 * request["samples"], "sides": sides, "unjudged": unjudged}
 
 
-def _rendered(surfaces, light: pathlib.Path, request: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Two pictures [2 h w 4], and the pixels [2 h w] of `asset_scenes.View.sides`."""
+def _rendered(
+    surfaces: Sequence[asset_files.Surface],
+    light: pathlib.Path,
+    request: dict[str, Any],
+    drawn: np.ndarray,
+    known: tuple[np.ndarray, int, np.ndarray] | None,
+) -> tuple[np.ndarray, int, np.ndarray]:
+    """The sum of blocks of two pictures [2 h w 4], their number, and the pixels [2 h w] of `asset_scenes.View.sides`.
+
+    Blocks are added to those that are `known` until the error of the picture that was `drawn` is certain.
+    """
+    if known is not None and _certain(*known, drawn):
+        return known
     bounces = BOUNCES * request["bounces"]
     view = asset_scenes.View(surfaces, light, request["camera"], model=request["model"], bounces=bounces)
-    sides = np.stack(view.sides())
-    total, noise, blocks = np.zeros(()), np.inf, 0
-    while noise > NOISE and blocks < BLOCKS:
+    total, blocks, sides = (np.zeros(()), 0, np.stack(view.sides())) if known is None else known
+    while not blocks or not _certain(total, blocks, sides, drawn):
         seeds = (2 * blocks + 1, 2 * blocks + 2)
         total = total + np.stack([view.picture(request["samples"], seed).astype(np.float64) for seed in seeds])
         blocks += 1
-        seen = (total[..., 3] > 0).any(0)
-        one, other = (half[seen][:, :3] for half in total)
-        noise = float(np.linalg.norm(one - other) / max(np.linalg.norm(one + other), 1e-9))
-    return total / blocks, sides
+    return total, blocks, sides
+
+
+def _certain(total: np.ndarray, blocks: int, sides: np.ndarray, drawn: np.ndarray) -> bool:
+    """Whether Mitsuba's noise is small beside the error of a picture, or as small as it gets."""
+    halves = np.where(sides[1][..., None], 0, total / blocks)
+    if blocks >= BLOCKS or not (halves[..., 3] > 0).all(0).any():
+        return True
+    truth = denoised.Truth(halves, blocks, covered=0.0)
+    return _CERTAIN * truth.noise <= truth.error(drawn)
 
 
 def sheet(drawn: np.ndarray, truth: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, float]:

@@ -110,7 +110,7 @@ def denoise(
 class Truth:
     """A converged picture as two halves with independent noise, and what pictures are off from it.
 
-    Pixels that surfaces fill are compared; the background is left out.
+    Pixels that surfaces fill are compared, or all that they touch; the background is left out.
 
     Attributes:
         mean: Linear radiance [h w 3], zero where pixels are not compared.
@@ -119,9 +119,9 @@ class Truth:
         samples: Of both halves.
     """
 
-    def __init__(self, halves: np.ndarray, samples: int):
-        """Takes the halves [2 h w 4] of so many samples."""
-        self.inside = np.all(halves[..., 3] > _COVERED, 0)
+    def __init__(self, halves: np.ndarray, samples: int, *, covered: float = _COVERED):
+        """Takes the halves [2 h w 4] of so many samples, at pixels of which surfaces cover more than a share."""
+        self.inside = np.all(halves[..., 3] > covered, 0)
         if not self.inside.any():
             raise ValueError("the camera must see surfaces that fill pixels, got none")
         self.samples = samples

@@ -230,6 +230,61 @@ def _tangent_frame(si, rotation=0.0) -> tuple[Any, Any]:
     )
 
 
+def along_tangents(inner: Any) -> Any:
+    """Mitsuba's material whose tangents, such as those of its normal map, are the attribute `TANGENT` of its shape."""
+    return _along_tangents()(inner)
+
+
+@per_variant
+def _along_tangents() -> Any:
+    _, mitsuba = modules()
+
+    class AlongTangents(mitsuba.BSDF):
+        def __init__(self, inner):
+            super().__init__(mitsuba.Properties())
+            self.inner = inner
+            self.m_components = [inner.flags(number) for number in range(inner.component_count())]
+            self.m_flags = inner.flags()
+
+        def turned(self, si):
+            """The interaction in the frame of the tangent, and directions to it and back."""
+            to, back = _tangent_frame(si)
+            result = mitsuba.SurfaceInteraction3f(si)
+            result.wi = to(si.wi)
+            result.dp_du = si.to_world(back(mitsuba.Vector3f(1, 0, 0)))
+            result.sh_frame = mitsuba.Frame3f(result.dp_du, si.to_world(back(mitsuba.Vector3f(0, 1, 0))), si.sh_frame.n)
+            return result, to, back
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            turned, _, back = self.turned(si)
+            result, weight = self.inner.sample(ctx, turned, sample1, sample2, active)
+            result.wo = back(result.wo)
+            return result, weight
+
+        def eval(self, ctx, si, wo, active=True):
+            turned, to, _ = self.turned(si)
+            return self.inner.eval(ctx, turned, to(wo), active)
+
+        def pdf(self, ctx, si, wo, active=True):
+            turned, to, _ = self.turned(si)
+            return self.inner.pdf(ctx, turned, to(wo), active)
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            turned, to, _ = self.turned(si)
+            return self.inner.eval_pdf(ctx, turned, to(wo), active)
+
+        def eval_diffuse_reflectance(self, si, active=True):
+            return self.inner.eval_diffuse_reflectance(self.turned(si)[0], active)
+
+        def traverse(self, callback):
+            callback.put("inner", self.inner, mitsuba.ParamFlags.Differentiable)
+
+        def to_string(self):
+            return "AlongTangents"
+
+    return AlongTangents
+
+
 @per_variant
 def _cook_torrance() -> Any:
     drjit, mitsuba = modules()

@@ -1,9 +1,12 @@
 """The judge of files is judged: its reader beside trimesh, its light, its normal maps, its alpha and its counts."""
 
 import base64
+import dataclasses
+import io
 import json
 
 import numpy as np
+import PIL.Image
 import pytest
 import trimesh
 
@@ -80,6 +83,28 @@ def test_sparse_and_normalized_accessors_follow_the_specification(small):
     np.testing.assert_array_equal(file.accessor(count - 1), [[0, 0, 0], [0, 0, 0], [9, 8, 7], [0, 0, 0]])
 
 
+def test_tangents_follow_nodes_and_webp_replaces_other_images(small):
+    stream = io.BytesIO()
+    PIL.Image.new("RGB", (2, 2), (255, 0, 0)).save(stream, "WEBP", lossless=True)
+
+    def change(document):
+        address = "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode()
+        document["images"].append({"uri": address})
+        document["textures"][0]["extensions"] = {"EXT_texture_webp": {"source": 1}}
+        content = np.tile(np.array([0, 0, 1, 1], "<f4"), (4, 1)).tobytes()
+        document["buffers"].append({"byteLength": 64, "uri": "data:;base64," + base64.b64encode(content).decode()})
+        document["bufferViews"].append({"buffer": 1, "byteLength": 64})
+        view = len(document["bufferViews"]) - 1
+        document["accessors"].append({"bufferView": view, "componentType": 5126, "count": 4, "type": "VEC4"})
+        document["meshes"][1]["primitives"][0]["attributes"]["TANGENT"] = len(document["accessors"]) - 1
+
+    edited(small, change)
+    by_color = {surface.color is None: surface for surface in asset_files.read(small)}
+    np.testing.assert_allclose(by_color[True].material.base_map.image, np.tile([1, 0, 0], (2, 2, 1)))
+    # Its node has a scale of -1 along z, which mirrors the tangent and turns the side of the bitangent.
+    np.testing.assert_allclose(by_color[False].tangent, np.tile([0, 0, -1, -1], (4, 1)))
+
+
 def test_strips_and_fans_wind_one_way():
     index = np.array([3, 1, 4, 0, 5])
     np.testing.assert_array_equal(asset_files._triangles(index, 5), [[3, 1, 4], [1, 0, 4], [4, 0, 5]])
@@ -113,11 +138,13 @@ def test_the_summary_counts_files_of_which_nothing_warned():
     line = {"case": "a", "error": 0.04, "seconds": 1.0, "bytes": 1, "loaded": True, "warnings": []}
     lines = [
         *(line, line | {"case": "b", "error": 0.3}, line | {"case": "c", "error": 0.2, "warnings": ["alpha"]}),
+        line | {"case": "f", "error": 0.9, "warnings": ["clear coat"], "unjudged": ["KHR_materials_clearcoat"]},
         {"case": "d", "error": None, "seconds": 1.0, "bytes": 1, "loaded": False, "refused": "no"},
         {"case": "e", "error": None, "seconds": 1.0, "bytes": 1, "loaded": False, "refused": "no", "unreadable": "no"},
     ]
     total = assets.summary(lines)
-    assert [total[key] for key in ("files", "valid", "loaded", "judged", "above", "silent")] == [5, 4, 3, 3, 2, 1]
+    names = ("files", "valid", "loaded", "judged", "partly", "above", "silent")
+    assert [total[key] for key in names] == [6, 5, 4, 3, 1, 2, 1]
     assert total["error"] == pytest.approx(0.2)
     assert total["silent_files"] == ["b"]
 
@@ -167,15 +194,21 @@ def test_the_sides_of_a_light_file_are_those_of_the_conventions(picture):
 
 
 @traced
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_normal_maps_tilt_towards_red_and_green(picture, mirrored):
+@pytest.mark.parametrize(
+    ("mirrored", "tangent"), [(False, None), (True, None), (True, (1, 0, 0, 1)), (False, (0, -1, 0, -1))]
+)
+def test_normal_maps_tilt_towards_red_and_green(picture, mirrored, tangent):
     # Light of a quarter sphere: half of the normal's part to its side, and half of its part along the surface's normal.
     place = PLACE * [-1, 1] + [1, 0] if mirrored else PLACE
-    for way, bright, dark in (([0.6, 0, 0.8], RIGHT, LEFT), ([0, 0.6, 0.8], ABOVE, BELOW)):
+    ways = ([0.6, 0, 0.8], RIGHT, LEFT), ([0, 0.6, 0.8], ABOVE, BELOW)
+    if tangent == (0, -1, 0, -1):  # red is down, and green, to the right of that, is left
+        ways = ([0.6, 0, 0.8], BELOW, ABOVE), ([0, 0.6, 0.8], LEFT, RIGHT)
+    for way, bright, dark in ways:
         image = np.broadcast_to((np.array(way) + 1) / 2, (4, 4, 3)).astype(np.float32)
         surface = quad(normal_map=asset_files.Map(image))
-        surface = asset_files.Surface(CORNER, FACE, surface.normal, {0: place}, None, surface.material)
-        if mirrored and way[0]:
+        given = None if tangent is None else np.tile(np.array(tangent, float), (4, 1))
+        surface = dataclasses.replace(surface, texture={0: place}, tangent=given)
+        if mirrored and tangent is None and way[0]:
             bright, dark = dark, bright
         values = [picture([surface], side)[0][0] for side in (bright, dark)]
         np.testing.assert_allclose(values, [0.7, 0.2], atol=0.02)
