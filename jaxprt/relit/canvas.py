@@ -92,8 +92,8 @@ def _texels_behind(
     environment: Environment, ray: Float[Array, "h w 3"], share: Float[Array, "h w *c"], *, colors: int
 ) -> Float[Array, "h w _"]:
     behind = background(environment, ray)
-    share = by_color(share, colors, axes=2).astype(behind.dtype)
-    picture = jnp.where(share > 0, share * behind, 0)
+    part = by_color(share, colors, axes=2).astype(behind.dtype)
+    picture = jnp.where(part > 0, part * behind, 0)
     return jnp.broadcast_to(picture, (*picture.shape[:2], colors))
 
 

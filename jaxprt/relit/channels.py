@@ -18,6 +18,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jaxprt import require
 from jaxprt.brdf import BlinnPhong, ClearCoat, CookTorrance, Lambert, MetallicRoughness, Sheen, grid
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import jit, known
@@ -90,9 +91,25 @@ class Shading(eqx.Module):
     @property
     def smoothest(self) -> Any:
         """Logarithm of the smallest roughness, as the standard table takes it: with that of a layer if any."""
-        assert self.blend is not None
-        least = tuple(float(np.min(np.asarray(row))) for row in self.blend.parameter)
+        least = tuple(float(np.min(np.asarray(row))) for row in self.weighted.parameter)
         return least if self.layered else least[0]
+
+    @property
+    def weighted(self) -> Blend:
+        """The blend, which a part with a BRDF that cannot change does not have."""
+        return require.kind("the weights of the part", self.blend, Blend, source="a material that may change")
+
+    @property
+    def metallic(self) -> MetallicRoughness:
+        """The metallic-roughness BRDF of every vertex, which a part with another model does not have."""
+        model = self.exact.model if isinstance(self.exact, PerVertex) else self.exact
+        return require.kind("the BRDF of the part", model, MetallicRoughness, source="a TexturedMaterial")
+
+    def blend_at(self, look: MaterialLook) -> Blend:
+        """The weights of the channels at points with given materials."""
+        if self.scale is None:
+            raise TypeError("the part must have a material that may change, got a BRDF that cannot")
+        return blend(look, self.term, self.scale, varies=bool(self.knot))
 
 
 class Appearance(eqx.Module):
@@ -265,8 +282,7 @@ def _metallic(look: MaterialLook, anisotropy: Any) -> MetallicRoughness:
 
 def _table_of_layer(part: Part) -> LayeredTable:
     """The tables of a part with a clear coat or a sheen. With a coat it loses its sheen, with a warning."""
-    material = part.material
-    assert isinstance(material, TexturedMaterial)
+    material = textured(part)
     if not material_table.may_be(material.clearcoat):
         return standard.SHEENED
     if material_table.may_be(material.sheen_color):
@@ -276,8 +292,7 @@ def _table_of_layer(part: Part) -> LayeredTable:
 
 def _layered(name: str, look: MaterialLook, table: LayeredTable) -> ClearCoat | Sheen:
     """The BRDF of each vertex or point of a part with a clear coat or a sheen."""
-    assert look.log_layer is not None
-    layer, roughness = look.coefficient[:, table.term[-1]], jnp.exp(look.log_layer)
+    layer, roughness = look.coefficient[:, table.term[-1]], jnp.exp(jnp.asarray(look.log_layer))
     try:
         if table == standard.COATED:
             return ClearCoat(_metallic(look, 0.0), layer[:, 0], roughness)
@@ -339,8 +354,7 @@ def appearance(part: Part, shading: Shading, material: Changeable, *, look: Mate
     """
     new = _replace_material(part, shading, material)
     look = _look(new) if look is None else look
-    assert shading.scale is not None
-    weights = blend(look, shading.term, shading.scale, varies=bool(shading.knot))
+    weights = shading.blend_at(look)
     emitted = None if known(look.emitted) and not np.any(look.emitted) else look.emitted
     if isinstance(material, BlinnPhong | CookTorrance):
         return Appearance(weights)
@@ -362,8 +376,7 @@ def _replace_material(part: Part, shading: Shading, material: Changeable) -> Par
     if not isinstance(material, model):
         raise TypeError(f"the material of part {part.name!r} must be a {model.__name__}, got {type(material).__name__}")
     if isinstance(material, BlinnPhong | CookTorrance):
-        assert shading.table is not None
-        if known(material) and not _in_range(material, shading.table):
+        if shading.table is not None and known(material) and not _in_range(material, shading.table):
             _refuse_range(part.name, material, shading.table)
         return dataclasses.replace(part, material=material)
     new = dataclasses.replace(part, material=material)
@@ -384,8 +397,7 @@ def _refuse_range(name: str, material: BlinnPhong | CookTorrance, table: Standar
 
 def _check_opacity(part: Part, material: TexturedMaterial) -> None:
     """Refuses another transmission than the precomputed one, and holes or opacity where there were none."""
-    before = part.material
-    assert isinstance(before, TexturedMaterial)
+    before = textured(part)
     old, new = float(before.transmission), float(material.transmission)
     if abs(old - new) > _EQUAL:
         raise ValueError(
@@ -415,11 +427,10 @@ def at_points(part: Part, shading: Shading, material: Any, points: Points) -> Ap
         return jax.tree.map(points.carry, material)
     if shading.blend is None:
         return Appearance(None)
-    assert shading.scale is not None
     if material is not None:
         part = dataclasses.replace(part, material=material)
     look = material_table.of_parts([part]).at(points)
-    return Appearance(blend(look, shading.term, shading.scale, varies=bool(shading.knot)), look.emitted)
+    return Appearance(shading.blend_at(look), look.emitted)
 
 
 def materials_at(parts: Sequence[Part], shading: Shading, points: Points) -> tuple[Blend | None, Callable]:
@@ -432,9 +443,8 @@ def materials_at(parts: Sequence[Part], shading: Shading, points: Points) -> tup
     """
     if shading.blend is None:
         return None, shading.exact
-    assert shading.scale is not None
     look = material_table.of_parts(parts).at(points)
-    weights = blend(look, shading.term, shading.scale, varies=bool(shading.knot))
+    weights = shading.blend_at(look)
     values = look.values
     if isinstance(parts[0].material, BlinnPhong):
         exponent = 2 / values.roughness**2 - 2
@@ -499,9 +509,7 @@ def _log_range(shading: Shading) -> tuple[float, float]:
     """Logarithms of the smallest and the largest roughness of a part with a table of its own."""
     if shading.knot:
         return float(shading.knot[0][0]), float(shading.knot[0][-1])
-    assert isinstance(shading.exact, PerVertex)
-    assert isinstance(shading.exact.model, MetallicRoughness)
-    value = np.log(np.maximum(np.asarray(shading.exact.model.roughness), SMOOTHEST))
+    value = np.log(np.maximum(np.asarray(shading.metallic.roughness), SMOOTHEST))
     return float(value.min()), float(value.max())
 
 
@@ -531,15 +539,17 @@ def _anisotropy(shading: Shading) -> float:
     """The anisotropy that a part was precomputed with."""
     if shading.layered:
         return 0.0
-    assert isinstance(shading.exact, PerVertex)
-    assert isinstance(shading.exact.model, MetallicRoughness)
-    return float(shading.exact.model.anisotropy[0])
+    return float(shading.metallic.anisotropy[0])
+
+
+def textured(part: Part) -> TexturedMaterial:
+    """The material of a part that has a TexturedMaterial."""
+    return require.kind(f"the material of part {part.name!r}", part.material, TexturedMaterial, source="jaxprt.scene")
 
 
 def _anisotropic_mesh(part: Part) -> tuple[Mesh, float]:
     """The mesh with tangents along the anisotropy, and the mean anisotropy."""
-    material = part.material
-    assert isinstance(material, TexturedMaterial)
+    material = textured(part)
     if not float(material.anisotropy):
         return part.mesh, 0.0
     surface = part.surface()
@@ -590,8 +600,7 @@ def is_model(material: Any) -> bool:
 
 def check_blend(name: str, shading: Shading, blend: Blend | None) -> None:
     """Refuses weights of other vertices or channels, and other parameters, than a part has."""
-    before = shading.blend
-    assert before is not None
+    before = shading.weighted
     if blend is None or len(blend.parameter) != len(before.parameter):
         got = "no weights" if blend is None else f"{len(blend.parameter)} parameters"
         raise ValueError(f"the material of part {name!r} must have {len(before.parameter)} parameters, got {got}")

@@ -43,8 +43,7 @@ def of_part(shading: Shading, system: System) -> float:
     """
     degree_of = system.degree
     if shading.table is not None:
-        assert shading.blend is not None
-        weight = np.mean(np.asarray(shading.blend.weight, np.float64), (0, 2))
+        weight = np.mean(np.asarray(shading.weighted.weight, np.float64), (0, 2))
         return shading.table.curvature(shading.smoothest, weight, degree_of)
     brdf: Callable = shading.brdf(jnp.asarray(shading.knot[0][0])) if shading.knot else shading.brdf
     wo = jnp.asarray(_VIEW)

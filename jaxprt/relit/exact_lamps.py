@@ -122,7 +122,8 @@ class Lamps(NamedTuple):
         position, axes = (np.asarray(column) for column in placed(mesh.position, frame, points))
         smooth = points if points.normal is None else points.tilted(None)
         above = np.asarray(smooth.frame(frame))[:, 2]
-        return self._reflect(Receivers(position, visibility.point_starts(mesh, points), axes, above), brdf, eye)
+        receivers = Receivers(position, visibility.point_starts(mesh, points), axes, above)
+        return self._reflect(self.occluder, receivers, brdf, eye)
 
     def at_vertices(
         self, mesh: Mesh, brdf: Callable, vertex: Int[np.ndarray, " p"], eye: Float[Array, "3"]
@@ -132,15 +133,17 @@ class Lamps(NamedTuple):
             return 0.0
         frame = np.asarray(directions.frame(mesh.normal, mesh.tangent))[vertex]
         start = visibility.start_points(mesh, self.occluder)[vertex]
-        return self._reflect(Receivers(np.asarray(mesh.position)[vertex], start, frame, frame[:, 2]), brdf, eye)
+        receivers = Receivers(np.asarray(mesh.position)[vertex], start, frame, frame[:, 2])
+        return self._reflect(self.occluder, receivers, brdf, eye)
 
-    def _reflect(self, receivers: Receivers, brdf: Callable, eye: Array) -> Float[np.ndarray, "p c"]:
-        assert self.occluder is not None
+    def _reflect(
+        self, occluder: Occluder, receivers: Receivers, brdf: Callable, eye: Array
+    ) -> Float[np.ndarray, "p c"]:
         random, rows, count = np.random.default_rng(2), [], len(receivers.position)
         for first in range(0, count, _BLOCK):
             index = np.resize(np.arange(first, min(first + _BLOCK, count)), _BLOCK)
             block = Receivers(*(column[index] for column in receivers))
-            arriving = [_arriving(block, lamp, self.occluder, random) for lamp in self.lamp]
+            arriving = [_arriving(block, lamp, occluder, random) for lamp in self.lamp]
             wi, light = (np.concatenate(parts, 1) for parts in zip(*arriving, strict=True))
             model = PerVertex(brdf.of(jnp.asarray(index))) if isinstance(brdf, PerVertex) else grid.as_argument(brdf)
             rows.append(np.asarray(_reflect(model, *map(jnp.asarray, (block.position, block.frame, wi, light)), eye)))

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxprt import require
 from jaxprt.brdf.varying import Channels
 from jaxprt.relit.channels import Shading
 from jaxprt.systems import bounces, harmonic, separable, standard
@@ -114,8 +115,7 @@ def still(shading: Shading) -> Callable:
     """The BRDF of a part; at the mean roughness if roughness varies."""
     if not shading.knot:
         return shading.brdf
-    assert shading.blend is not None
-    return shading.brdf(*(jnp.asarray(np.mean(row)) for row in shading.blend.parameter))
+    return shading.brdf(*(jnp.asarray(np.mean(row)) for row in shading.weighted.parameter))
 
 
 def widened(brdf: Callable) -> Callable:
@@ -162,7 +162,7 @@ def _matte(brdf: Callable) -> np.ndarray | None:
 
 def _lobes(brdf: Callable, which: np.ndarray) -> Callable:
     """The selected channels, widened and without their scales."""
-    assert isinstance(brdf, Channels)
+    brdf = require.kind("the BRDF", brdf, Channels, source="a material that may change")
     models = tuple(itertools.compress(brdf.model, which))
     return widened(Channels(models, jnp.ones(len(models), brdf.scale.dtype)))
 

@@ -435,7 +435,6 @@ def samples_of(shading: Shading, size: int) -> int:
     if shading.matte:
         return 1
     if shading.table is not None:
-        assert shading.blend is not None
         return shading.table.samples(shading.smoothest, size)
     sharpest: Callable = shading.brdf(jnp.asarray(shading.knot[0][0])) if shading.knot else shading.brdf
     return bright_texels.samples_for(sharpest, size=size)

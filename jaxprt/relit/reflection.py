@@ -144,8 +144,7 @@ def is_sharp(shading: Shading, table: LobeBrdf | None) -> bool:
     if table is None or shading.matte:
         return False
     if shading.table is not None:
-        assert shading.blend is not None
-        weight = np.mean(np.asarray(shading.blend.weight, np.float64), 0)
+        weight = np.mean(np.asarray(shading.weighted.weight, np.float64), 0)
         brightest = np.argmax(np.asarray(shading.scale) @ weight)
         return shading.table.is_sharp(shading.smoothest, weight[:, brightest])
     return bool(traced.is_sharp(table))

@@ -131,9 +131,8 @@ class Sample:
         """The sample of the group's only part with a BRDF of its own; None if that varies over the surface."""
         if shading.knot or shading.matte:
             return None
-        vertex = self.target.vertex
-        assert vertex is not None
-        whole = Points(jnp.asarray(vertex)[self.points.corner], self.points.weight)
+        vertex, corner = self.target.vertex, self.points.corner
+        whole = Points(corner if vertex is None else jnp.asarray(vertex)[corner], self.points.weight)
         blend, _ = channels.materials_at([part], shading, whole)
         return dataclasses.replace(self, shading=shading, blend=blend)
 

@@ -276,8 +276,7 @@ class RelitScene(System):
         require.kind("the view", view, SceneView, source="RelitScene.view")
         if isinstance(light, SceneLight) and self.bounces is None and self.lamps is None:
             light = Arriving(light.direct, None, None)  # Materials do not change it.
-        require.kind("the light", light, Arriving, source="RelitScene.shade")
-        assert isinstance(light, Arriving)
+        light = require.kind("the light", light, Arriving, source="RelitScene.shade")
         traced = iter(()) if view.reflected is None else iter(view.reflected.radiance(view.stage, light))
         colors = []
         for group, (surface, viewed) in enumerate(zip(self.surfaces, view.group, strict=True)):
@@ -399,8 +398,7 @@ class RelitScene(System):
         dtype = self.mesh.position.dtype
         flag = self.layout.column(group, [np.full(*row, dtype) for row in zip(counts, flags, strict=True)])
         emitted = np.zeros((self.layout.size[group], 3), dtype) if whole.emitted is None else whole.emitted
-        assert whole.blend is not None
-        return put(VertexMaterials(whole.blend, emitted, flag))
+        return None if whole.blend is None else put(VertexMaterials(whole.blend, emitted, flag))
 
     @promoted
     def radiance(

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree, UInt8
 
+from jaxprt import require
 from jaxprt.compile import jit, kept, mapped
 from jaxprt.relit.groups import Surface, VertexMaterials, material
 from jaxprt.scene.material_table import MaterialLook
@@ -130,9 +131,9 @@ def radiance(
     """
     color = _lit(surface, arriving, viewed.seen, viewed.points, viewed.emitted)
     if texels is not None:
-        assert viewed.sight is not None
         *rows, size, samples = texels
-        color = color + _from_texels(surface, viewed.sight, *rows, size=size, samples=samples)
+        sight = require.kind("the sight of the points", viewed.sight, Sight, source="surface.view")
+        color = color + _from_texels(surface, sight, *rows, size=size, samples=samples)
     return color if reflections is None else color + reflections
 
 

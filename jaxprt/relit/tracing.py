@@ -161,8 +161,7 @@ def trace(stage: Stage, origins: Sequence[RayOrigins], eye: Float[Array, "3"], *
 def _reflecting(stage: Stage, origin: RayOrigins) -> ReflectingPart:
     """How the group of some origins reflects."""
     reflecting = stage.surfaces[origin.group].reflecting
-    assert reflecting is not None
-    return reflecting
+    return require.kind("what reflects", reflecting, ReflectingPart, source="a precomputation with bounces")
 
 
 def _lamps(

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxprt import require
 from jaxprt.brdf import ClearCoat, Sheen
 from jaxprt.brdf.varying import PerVertex
 from jaxprt.compile import put
@@ -257,21 +258,19 @@ def _unshadowed(part: Part, shading: Shading, size: int) -> tuple[Part, Shading,
 
 def _bare(part: Part) -> Part:
     """The part with the base of its material."""
-    assert isinstance(part.material, TexturedMaterial)
-    return dataclasses.replace(part, material=channels.without_layers(part.material))
+    return dataclasses.replace(part, material=channels.without_layers(channels.textured(part)))
 
 
 def _base_shading(shading: Shading) -> Shading:
     """The base of a part under a layer."""
-    table, blend, exact = standard.METALLIC_ROUGHNESS, shading.blend, shading.exact
-    assert blend is not None
-    assert isinstance(exact, PerVertex)
-    assert isinstance(exact.model, ClearCoat | Sheen)
+    table, blend, exact = standard.METALLIC_ROUGHNESS, shading.weighted, shading.exact
+    over = exact.model if isinstance(exact, PerVertex) else exact
+    base = require.kind("the BRDF under a layer", over, ClearCoat, Sheen, source="a TexturedMaterial").base
     weight = jnp.asarray(blend.weight[:, :BASE] + blend.weight[:, BASE : 2 * BASE])
     return dataclasses.replace(
         shading,
         brdf=table.family,
-        exact=PerVertex(exact.model.base),
+        exact=PerVertex(base),
         knot=table.knots,
         blend=Blend(weight, blend.parameter[:1]),
         term=table.term,

@@ -9,6 +9,7 @@ the albedo d with the view or the materials.
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -92,7 +93,6 @@ class DynamicSystem(protocol.VertexSystem):
     def tilted(self, light: DynamicLight, normal: Float[Array, "v 3"]) -> DynamicLight:
         """The light with vector irradiance, for the diffuse part: `System.tilted`."""
         pyramid, blurred = self.transport.pyramid, light.blurred
-        assert blurred.irradiance is not None
         flux = diffuse.flux(blurred.coefficient, pyramid.vector, normal, size=pyramid.size)
         return dataclasses.replace(light, blurred=dataclasses.replace(blurred, flux=_turned(flux, blurred, normal)))
 
@@ -123,11 +123,10 @@ class DynamicSystem(protocol.VertexSystem):
         require.kind("the light", light, DynamicLight, source="DynamicSystem.light")
         require.kind("the view", view, DynamicView, source="DynamicSystem.view")
         light = self.shade(light) if light.arriving is None else light
-        assert light.arriving is not None
         result = self.lobe_part.combine(light.blurred, view.lobes, points)
         if not self.brdf.terms:
             return result
-        return result + combine(points.carry(light.arriving), view.factor)
+        return result + combine(points.carry(_shaded(light.arriving)), view.factor)
 
     @property
     def lobe_part(self) -> LobeSystem:
@@ -161,6 +160,10 @@ def _direction(position: Array, frame: Array, points: Points, eye: Array) -> Flo
 @jit
 def _turned(flux: Float[Array, "c 3 v"], light: LobeLight, normal: Float[Array, "v 3"]) -> Float[Array, "c 3 v"]:
     """Vector irradiance whose component along the normals is the irradiance of the transport."""
-    assert light.irradiance is not None
     along = jnp.sum(flux * normal.T, 1)
-    return flux + (light.irradiance - along)[:, None] * normal.T
+    return flux + (_shaded(light.irradiance) - along)[:, None] * normal.T
+
+
+def _shaded(value: Array | None) -> Array:
+    """What the light has after `DynamicSystem.shade`."""
+    return require.kind("what arrives", value, jax.Array, source="DynamicSystem.shade")
