@@ -1,7 +1,6 @@
 """Files that are written: complete, or not at all."""
 
 import os
-import pathlib
 import stat
 import subprocess
 import sys
@@ -226,25 +225,6 @@ def test_a_file_that_does_not_hold_what_was_written_is_not_accepted(tmp_path, mo
             write(path, random_image(90, 80, 3))
         assert path.read_bytes() == old
     assert sorted(tmp_path.iterdir()) == [path, other]
-
-
-@pytest.mark.parametrize(("write", "suffix"), [(write_exr, ".exr"), (write_png, ".png")])
-def test_directories_pipes_and_devices_are_not_replaced(tmp_path, write, suffix):
-    image = random_image(4, 5, 3)
-    for name in ("folder", "pipe", "full", "circle"):
-        path = tmp_path / f"{name}{suffix}"
-        if name == "folder":
-            path.mkdir()
-        elif name == "pipe":
-            os.mkfifo(path)
-        elif name == "full":
-            path.symlink_to("/dev/full")
-        else:
-            path.symlink_to(path)
-        with pytest.raises(OSError, match=rf"{name}{suffix} (must be a|cannot be written)"):
-            write(path, image)
-    assert pathlib.Path("/dev/full").is_char_device()
-    assert len(list(tmp_path.iterdir())) == 4
 
 
 def test_what_is_not_finite_and_large_images_are_written_in_blocks(tmp_path, monkeypatch):
