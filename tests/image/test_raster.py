@@ -149,20 +149,6 @@ def test_primary_hits_equal_embree():
         assert len(set(face[triangle[i, j]]) & set(face[traced[i, j]])) >= 1
 
 
-def test_an_interpolated_position_lies_on_its_pixels_ray():
-    position, face = _soup(7, 200)
-    camera = _camera(eye=(0, 0, 8), target=(0.3, 0.2, 0), up=(0.2, 1, 0))
-    mesh = _mesh(position, face)
-    fragments = raster.rasterize(mesh, camera)
-    seen = np.asarray(fragments.triangle >= 0)
-    point = pixels.interpolate(fragments, mesh.face, mesh.position)
-    ray = raster.ray_direction(camera)
-    forward = _view_axes(camera)[2]
-    expected = camera.eye + ray * (fragments.depth / (ray @ forward))[..., None]
-    assert seen.mean() > 0.5
-    np.testing.assert_allclose(point[seen], expected[seen], atol=8 * POSITION_TOLERANCE)
-
-
 def test_the_ground_ends_at_the_horizon_though_it_reaches_behind_the_camera():
     camera = _camera(eye=(0, 1, 0), target=(0, 1, -1))
     mesh = _mesh([[-300, 0, -300], [300, 0, -300], [0, 0, 600]], [[0, 1, 2]])
@@ -196,16 +182,6 @@ def test_triangles_without_area_draw_nothing():
     np.testing.assert_array_equal(fragments.triangle, -1)
     assert not any(np.isnan(leaf).any() for leaf in jax.tree.leaves(fragments))
     assert np.all(pixels.render(mesh, mesh.position, camera) == 0)
-
-
-def test_the_order_and_direction_of_triangles_do_not_change_the_picture():
-    position, face = _torus(20, 12)
-    camera, rng = _camera(eye=(0, 1, 3)), np.random.default_rng(0)
-    order = rng.permutation(len(face))
-    base = raster.rasterize(_mesh(position, face), camera)
-    other = raster.rasterize(_mesh(position, face[order][:, ::-1]), camera)
-    np.testing.assert_array_equal(np.where(other.triangle >= 0, order[other.triangle], -1), base.triangle)
-    np.testing.assert_allclose(other.barycentric[..., ::-1], base.barycentric, atol=1e-5)
 
 
 def test_more_patches_than_a_chunk_are_all_drawn(monkeypatch):
