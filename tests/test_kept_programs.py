@@ -25,7 +25,7 @@ from numba.core import types as numba_types
 from numba.core.caching import NullCache
 
 from jaxprt import Camera
-from jaxprt.compile import kept
+from jaxprt.compile import kept, numba_loop
 from jaxprt.image import raster
 from jaxprt.programs import executables, jax_cache, loops, store
 from jaxprt.programs.store import Store
@@ -655,3 +655,10 @@ def test_what_differs_in_shape_type_or_static_values_is_another_executable(kept_
     assert len(list(kept_files.folder.iterdir())) == 4
     with pytest.raises(ValueError, match="Non-hashable static"):
         kept(inspect.unwrap(raster.rasterize), static=("samples",))(None, camera(), samples=[1])
+
+
+def test_one_line_turns_it_off_for_loops(monkeypatch):
+    monkeypatch.setenv("JAXPRT_KEEP_PROGRAMS", "0")
+    loop = numba_loop(doubled)
+    assert isinstance(vars(loop)["_cache"], NullCache)
+    assert loop(2.0) == 4

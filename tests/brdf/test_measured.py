@@ -282,3 +282,10 @@ def test_bad_tables_of_factors_are_refused(npf, tmp_path):
     names.write_text("iron " * 300)
     with pytest.raises(ValueError, match=r"names.txt: must hold at most 256 names, got 300"):
         load_npf(path, "iron", names=names)
+
+
+def test_value_per_cosine_is_bounded_at_grazing_angles(npf):
+    brdf = load_npf(npf, "white-marble")
+    low = jnp.array([[1.0, 0, 1e-6], [1.0, 0, 1e-3], [1.0, 0, 8e-3]])
+    found = evaluate(brdf, low, jnp.broadcast_to(jnp.array([-0.6, 0, 0.8]), low.shape))
+    np.testing.assert_allclose(found, jnp.broadcast_to(found[2], found.shape), rtol=0.1)

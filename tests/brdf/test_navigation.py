@@ -539,3 +539,28 @@ def test_columns_may_be_in_any_order_with_others_between(tmp_path, close):
 def test_bad_tables_of_materials_are_refused(tmp_path, text, message):
     with pytest.raises(ValueError, match=f"table.csv: .*{message.removeprefix('table.csv: ')}"):
         cook_torrance(path=write(tmp_path, text))
+
+
+@each_straight_plane
+def test_far_away_the_nearest_point_is_the_outermost_in_that_direction(kind):
+    """In float32, the squares of distances of 1e6 would all be equal."""
+    plane = make(kind)
+    point, angle = np.asarray(plane.point, float), 0.1 + np.arange(40) * np.pi / 20
+    direction = np.stack([np.cos(angle), np.sin(angle)], -1)
+    spot = point.min(0) + 1e6 * np.ptp(point, axis=0) * direction
+    reach = np.max(scaled(plane, point) @ direction.T, 0)
+    np.testing.assert_allclose(np.sum(placed(plane, spot) * direction, -1), reach, atol=1e-5)
+
+
+def test_between_exponents_the_model_is_that_of_the_exponent_asked_for(close):
+    """Weights reproduce coordinates: exponents and roughness in the logarithm, an exponent from 0 up as it is."""
+    log = blinn_phong(exponents=(1.0, 8.0, 64.0)).navigation
+    for exponent in (1.5, 30.0, 64.0):
+        close(jnp.exp(log.weight(exponent) @ jnp.log(log.knot)), np.float32(exponent))
+    plain = blinn_phong(exponents=(0.0, 8.0, 64.0)).navigation
+    for exponent in (0.5, 30.0):
+        close(plain.weight(exponent) @ plain.knot, np.float32(exponent))
+    plane = cook_torrance().navigation
+    for place in ((0.2, 0.05), (0.7, 0.333)):
+        f0, log_m = plane.weight(jnp.array(place)) @ jnp.asarray(plane.chart(plane.point))
+        close(jnp.stack([f0, jnp.exp(log_m)]), np.array(place))

@@ -224,3 +224,9 @@ def test_files_that_are_not_samples_are_refused(tmp_path, text, message):
 def test_bad_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         scattered.interpolate_scattered(upper(20), upper(20, 1), np.ones((20, 3)), **options)
+
+
+def test_samples_on_one_plane_are_refused():
+    wi = upper(30)
+    with pytest.raises(ValueError, match="must not all lie on one plane"):
+        scattered.interpolate_scattered(wi, wi, np.ones((30, 1)))

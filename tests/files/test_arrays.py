@@ -64,7 +64,7 @@ def place(path, name, number):
 
 
 def test_blocks_read_back_as_written_in_any_order(tmp_path):
-    store = open_store(tmp_path / "a.prt")
+    store = open_store(tmp_path / "some" / "where" / "a.prt")
     for number in (3, 0, 4):
         store.write(number, block(number))
     assert found(store.path) == [0, 3, 4]

@@ -629,3 +629,15 @@ def test_formats_and_resolutions_of_other_kinds_are_refused():
     for size in (b"-Y 0 +X 4", b"-Y 60000 +X 60000"):
         with pytest.raises(ValueError, match=r"sky\.hdr must have 1 to 268435456 pixels"):
             read(RED, 1, resolution=size)
+
+
+@pytest.mark.parametrize("name", ["image.exr", "image.hdr", "image.png", "image.jpg"])
+def test_truncated_files_are_refused_by_name(tmp_path, name):
+    path = tmp_path / name
+    image = random_image(64, 64, 3)
+    write_exr(path, image) if name.endswith("exr") else write_oiio(path, image, "uint8")
+    whole = path.read_bytes()
+    for length in (0, 3, 100, len(whole) // 2, len(whole) - 40):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=name):
+            read_image(path)

@@ -1,6 +1,7 @@
 """Files that are written: complete, or not at all."""
 
 import os
+import pathlib
 import stat
 import subprocess
 import sys
@@ -235,3 +236,22 @@ def test_what_is_not_finite_and_large_images_are_written_in_blocks(tmp_path, mon
     np.testing.assert_array_equal(read_image(tmp_path / "image.exr")[0], image)
     for channels in (1, 3, 4):
         write_png(tmp_path / "image.png", random_image(50, 20, channels))
+
+
+@pytest.mark.parametrize(("write", "suffix"), [(write_exr, ".exr"), (write_png, ".png")])
+def test_directories_pipes_and_devices_are_not_replaced(tmp_path, write, suffix):
+    image = random_image(4, 5, 3)
+    for name in ("folder", "pipe", "full", "circle"):
+        path = tmp_path / f"{name}{suffix}"
+        if name == "folder":
+            path.mkdir()
+        elif name == "pipe":
+            os.mkfifo(path)
+        elif name == "full":
+            path.symlink_to("/dev/full")
+        else:
+            path.symlink_to(path)
+        with pytest.raises(OSError, match=rf"{name}{suffix} (must be a|cannot be written)"):
+            write(path, image)
+    assert pathlib.Path("/dev/full").is_char_device()
+    assert len(list(tmp_path.iterdir())) == 4

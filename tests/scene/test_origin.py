@@ -242,3 +242,8 @@ def test_systems_of_far_meshes_say_that_eyes_are_relative():
 def test_one_number_stands_for_three_coordinates_also_where_float32_rounds_it():
     for number in (1.5, 100.1):
         np.testing.assert_array_equal(prt.scene.PointLight("bulb", number).position, [number] * 3)
+
+
+def test_a_mesh_near_zero_has_its_origin_there():
+    for shift in (0.0, 30.0, [0.0, 200.0, 0.0]):
+        assert make_mesh(np.asarray(ball().vertices) + shift, ball().faces).origin == origin.ZERO

@@ -572,3 +572,10 @@ def test_what_is_not_read_of_lights_is_named_once(tmp_path):
     with pytest.warns(UserWarning, match=message):
         scene = load_scene(writer.write(tmp_path / "a.glb"))
     assert not scene.suns
+
+
+def test_indices_beyond_the_vertices_are_refused(tmp_path):
+    writer = one((writer := Writer()).square(face=np.array([0, 1, 2, 0, 2, 9], np.uint8)), writer=writer)
+    message = r"refer to vertices 0 to 3 in indices of primitive 0 of mesh 0, got 1 of 6 .* first is 9 at 5"
+    with pytest.raises(ValueError, match=message):
+        load_scene(writer.write(tmp_path / "far.glb"))

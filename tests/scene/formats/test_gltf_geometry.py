@@ -525,3 +525,19 @@ def test_a_chain_of_ten_thousand_nodes_adds_up(tmp_path):
         node["scale"] = [2, 2, 2]
     with pytest.raises(ValueError, match=r"finite transforms to world coordinates, got .* at node \d+"):
         load_mesh(writer.write(tmp_path / "a.glb"))
+
+
+def test_quantized_texture_coordinates_are_whole_numbers(tmp_path):
+    writer = Writer()
+    one(writer.square(TEXCOORD_0=writer.accessor((3 * PLACE).astype(np.uint8))), writer=writer)
+    writer.header["extensionsUsed"] = ["KHR_mesh_quantization"]
+    np.testing.assert_array_equal(read(writer, tmp_path).mesh.texture, [0, 1] + PLACE * [3, -3])
+
+
+def test_nodes_without_a_skin_show_the_same_mesh_where_they_are(tmp_path):
+    writer = skinned(Writer(), JOINT, WEIGHT, SHIFTED)
+    writer.header["nodes"].append({"mesh": 0, "translation": [7, 0, 0]})
+    writer.header["scenes"] = [{"nodes": [3, 0]}]  # joints outside of the scene count too
+    mesh = load_mesh(writer.write(tmp_path / "a.glb"))
+    np.testing.assert_array_equal(mesh.position[:4], SQUARE + [7, 0, 0])
+    np.testing.assert_allclose(mesh.position[4], [0, 0, 4], atol=1e-6)

@@ -379,3 +379,11 @@ def test_dark_8_bit_colors_are_not_taken_for_fractions(tmp_path):
     rows = [(*position, 1, 1, 0) for position in SQUARE.tolist()]
     base, _ = colors(write(tmp_path, [("vertex", properties, rows), ("face", FACES, [([0, 1, 2, 3],)])]))
     np.testing.assert_allclose(base, [[1 / 255 / 12.92] * 2 + [0]] * 4, rtol=1e-5)
+
+
+def test_an_image_outside_of_the_folder_is_refused(tmp_path):
+    write_png(tmp_path / "image.png", IMAGE)
+    (tmp_path / "scene").mkdir()
+    for name in ("../image.png", str(tmp_path / "image.png"), "..\\image.png"):
+        with pytest.raises(ValueError, match=r"TextureFile must refer to files in the folder of the scene"):
+            load_scene(wedges(tmp_path / "scene", image=name))

@@ -271,3 +271,18 @@ def test_messages_shorten_names_that_are_data(place, kind):
     with pytest.warns(UserWarning, match="not supported and ignored are") as caught:
         load_scene(kind(place, uri))
     assert len(str(caught[0].message)) < 2000
+
+
+def test_several_libraries_in_one_line_are_all_refused_outside(place):
+    (place / "a.mtl").write_text("newmtl a\nKd 0 1 0\n")
+    with pytest.raises(ValueError, match=r"a\.obj, mtllib must refer to files in the folder"):
+        load_scene(scene_of_library(place, "a.mtl ../secret.mtl"))
+    with pytest.raises(ValueError, match=OUTSIDE):
+        load_scene(scene_of_library(place, "absent.mtl ../absent.mtl"))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("outside", ["no", 1, None])
+def test_only_true_opens_files_outside(place, outside):
+    with pytest.raises(TypeError, match="outside must be True or False, got"):
+        load_scene(scene_of_map(place, "../secret.png"), outside=outside)
