@@ -12,7 +12,7 @@ Public functions are found by walking the package; one without an example fails.
   A comment gives the reason.
 
 Public classes that can be called, as BRDF models can, have examples too: the first argument is the instance.
-Functions that are not pure, or run on the host, are named in HOST with the reason.
+Functions that are not pure, or run on the host, are named in REASONS.
 """
 
 import functools
@@ -49,208 +49,110 @@ STEP = 1e-6
 BATCH = 3
 JITTED = type(jax.jit(lambda: 0))
 
-HOST = {
-    "require": "checks values",
-    "compile": "takes functions",
-    "programs": "reads and writes files, and compiles",
-    "inverse": "takes functions, and fits on the host",
-    "cli": "reads and writes files, measures, and serves pages",
-    "brdf.fitted": "reads a file",
-    "view": "the same, and answers messages",
-    "relit": "traces rays, and chooses by values",
-    "files": "reads and writes files",
-    "scene.points.on_triangles": "checks values",
-    "scene.material_table": "takes parts; what they look like at points is in tests/scene/test_material_table.py",
-    "scene.texture.mipmap": "its number of results depends on the size",
-    "scene.texture.bilinear": "gives numbers of texels",
-    "visibility.picture_rays": "traces rays",
-    "image.raster.barycentric": "takes numbers of triangles; tests/image/test_pixels.py",
-    "scene.texture.unit_normals": "reads images on the host",
-    "scene.texture.tilt_normals": "clamps; tests/scene/test_texture.py has SciPy's answers",
-    "scene.texture.normal_variance": "the same",
-    "scene.texture.widen_roughness": "the same",
-    "scene.sides": "copies faces of scenes on the host",
-    "sphere.hats.centers": "a NumPy table",
-    "image.raster.front": "gives truth values",
-    "image.raster.front_faces": "the same",
-    "image.pixels.visible_points": "traces rays, and gives points whose number depends on the view",
-    "image.pixels.coverage": "traces rays",
-    "image.pixels.nearest_fragments": "the same",
-    "image.pixels.seen_from_front": "gives truth values",
-    "image.pixels.sky": "looks up pixels of files, on the host",
-    "image.pixels.pixel_angle": "measures a camera on the host",
-    "image.tonemap.apply_curve": "by NumPy or JAX, as the last argument says; image.tonemap.display is the function",
-    "image.pixels.shading_points": "has more padding in jit than outside; tests/image/test_pixels.py",
-    "visibility.rays": "traces rays",
-    "visibility.occluder": "traces rays",
-    "visibility.embree": "traces rays",
-    "visibility.picture_loops": "the same, by numba",
-    "visibility.blocks": "runs workers and writes files",
-    "visibility.refinement": "traces rays, and chooses by values",
-    "systems.separable.sparse.precompute": "traces rays",
-    "benchmarks.published.factorization": "checks values",
-    "benchmarks.published.lobes.mirror_lobes": "checks values",
-    "benchmarks.published.interreflection": "traces rays",
-    "benchmarks.published.lobes.SetMember": "takes an index",
-    "benchmarks.published.transfer": "takes half precision; tests/figures/test_transfer.py",
-    "benchmarks.published.tensors.hooi": "gives vectors of either sign",
-    "systems.axes": "reads annotations",
-    "systems.ranges": "cuts objects",
-    "visibility.stored.precompute": "traces rays",
-    "systems.lobe.blurred_light.blur": "makes numbers",
-    "sphere.hats.count": "a number",
-    "sphere.hats.table": "SciPy tables",
-    "sphere.hats.inverse_gram": "a table, on the light's device",
-    "systems.lobe.diffuse.cells": "a number",
-    "systems.lobe.diffuse.count": "the same",
-    "systems.lobe.diffuse.vectors": "gives bytes",
-    "systems.lobe.diffuse.harmonics_of": "takes bytes alone",
-    "systems.lobe.system.matte_transport": "takes arrays apart",
-    "systems.lobe.pyramid.precompute": "traces rays",
-    "systems.lobe.pyramid.compress": "runs through blocks on the host",
-    "systems.lobe.pyramid.bits": "cuts bytes",
-    "systems.lobe.pyramid.dither": "bits, in NumPy",
-    "systems.lamps.places": "chooses places on the host",
-    "systems.bright_texels.texel_radiance": "takes indices, frames and shares; bright_texels.radiance has them all",
-    "systems.lobe.diffuse.flux": "takes unit normals; tests/systems/lobe/test_diffuse.py",
-    "systems.lobe.diffuse.at_points": "takes points; tests/systems/lobe/test_diffuse.py",
-    "systems.lobe.pyramid.texel_bits": "the same",
-    "systems.lobe.pyramid.pyramid": "gives bytes",
-    "systems.lobe.pyramid.scales": "NumPy tables",
-    "systems.lobe.pyramid.between": "indices, of a NumPy table",
-    "systems.lobe.pyramid.corners": "indices beside the weights",
-    "systems.lobe.blurred_light.scales": "NumPy tables",
-    "systems.lamps.transport": "traces rays",
-    "systems.lobe.system.view_lobes": "gives indices beside weights, compiled in steps; combine has them all",
-    "systems.lobe.widened": "views and sums of systems; tests/systems/lobe/test_widened.py",
-    "systems.bounces.traced.is_sharp": "decides on the host",
-    "systems.bounces.traced.is_traced": "NumPy on the host",
-    "systems.bounces.traced.lookup": "a step of ReflectingPart; tests/systems/bounces/test_traced.py",
-    "systems.bounces.traced.harmonics_of": "a step of ReflectingPart; tests/systems/bounces/test_traced.py",
-    "systems.bounces.traced.quantiles": "a step of ReflectingPart; tests/systems/bounces/test_traced.py",
-    "systems.bounces.traced.weights": "a step of ReflectingPart; tests/systems/bounces/test_traced.py",
-    "systems.standard": "reads files, on the host; the rest fits what is in them",
-    "require.finite": "checks values on the host",
-    "require.length": "checks a shape",
-    "visibility.members.cluster": "sorts on the host, where data enters",
-    "visibility.members.clusters_for": "a count",
-    "visibility.members.coordinates": "NumPy on the host",
-    "visibility.members.places": "a NumPy table of rows",
-    "systems.separable.clustered.precompute": "runs workers and writes files",
-    "systems.separable.clustered.compress": "gives half precision, and vectors of either sign: no one dtype or answer",
-    "systems.separable.sparse.rms": "counts on the host, after precomputation",
-    "systems.harmonic.transfer.precompute": "traces rays",
-    "systems.harmonic.transfer.precompute_diffuse": "traces rays",
-    "systems.harmonic.transfer.check": "checks values",
-    "systems.harmonic.transfer.check_memory": "the same",
-    "systems.harmonic.exchange": "reads and writes files",
-    "systems.bright_texels.samples_for": "compares rules on the host",
-    "systems.adaptive": "integrates cells that a loop chooses; reference.integrate has them all",
-    "sphere.cubemap.axes": "a NumPy table of axes",
-    "systems.reference.radiance": "traces rays; its pure part is integrate",
-    "decompose.clustering": "sorts on the host, where data enters",
-    "decompose.eigen.orientation": "NumPy on the host",
-    "decompose.tucker.orient": "the same",
-    "decompose.tucker.hosvd": "gives vectors of either sign, whose reconstruction alone has derivatives",
-    "decompose.tucker.truncated": "the same",
-    "decompose.tucker.dominant": "the same",
-    "brdf.scattered": "reads files, checks values, and interpolates by SciPy",
-    "brdf.coat.coat_reflectance": "one formula for NumPy and JAX arrays",
-    "brdf.measured.cell_angles": "a NumPy table of angles",
-    "brdf.measured.lower_cosine": "a NumPy table of cosines",
-    "brdf.measured.tabulate": "fills tables by SciPy, where data enters",
-    "brdf.measured.require": "checks values",
-    "brdf.measured.load_merl": "reads a file",
-    "brdf.measured.load_npf": "reads a file",
-    "brdf.measured.check_unique": "checks names",
-    "brdf.measured.one_of": "checks a name",
-    "brdf.models.color": "converts a parameter where it enters",
-    "brdf.models.scalar": "the same",
-    "brdf.models.both_above": "gives truth values",
-    "brdf.models.half_vector": "tested through the models",
-    "brdf.grid": "gives indices beside weights; tested through the tables that are read by it",
-    "systems.harmonic.table.tabulate": "checks values, and chooses the quadrature by them",
-    "systems.separable.factorization.mark_of": "NumPy on the host",
-    "systems.separable.factorization.check_mark": "checks values",
-    "systems.separable.factorization.factor": "checks values, and chooses the number of terms by them",
-    "systems.lobe.table.tabulate": "checks values, and chooses the number of lobes by them",
-    "systems.lobe.table.brdf_samples": "checks values",
-    "systems.lobe.table.measured_error": "gives a Python number",
-    "systems.lobe.table.is_isotropic": "compares values",
-    "systems.dynamic.reflected.reflect": "checks values",
-    "systems.dynamic.reflected.check_values": "the same",
-    "systems.dynamic.reflected.stacked": "looks at types",
-    "systems.bounces.functions.basis": "counts colors by values",
-    "systems.bounces.functions.shared": "checks values, and turns singular vectors on the host",
-    "systems.bounces.functions.fixed_weights": "counts colors by values",
-    "systems.bounces.gather.rays": "traces rays",
-    "systems.bounces.build.precompute": "traces rays",
-    "systems.bounces.gather.shares": "NumPy on the host",
-    "systems.bounces.gather.cosines": "NumPy on the host",
-    "systems.bounces.gather.measures": "NumPy on the host",
-    "systems.bounces.patches.exchange": "traces rays",
-    "systems.bounces.patches.divide": "sorts on the host, where data enters",
-    "systems.bounces.tensor.twice": "a count",
-    "systems.bounces.jobs": "traces rays, and gives half precision and vectors of either sign",
-    "brdf.places.identity": "gives its argument; tested through the places",
-    "brdf.places.triangulate": "by SciPy, where data enters",
-    "brdf.places.in_columns": "compares values",
-    "brdf.places.columns": "sorts on the host, where data enters",
-    "brdf.navigation.blinn_phong": "checks values",
-    "brdf.navigation.cook_torrance": "reads a file",
-    "systems.dynamic.table.tabulate": "checks values",
-    "systems.dynamic.table.without_tensor": "empty arrays",
-    "systems.dynamic.transport.precompute": "traces rays",
-    "systems.dynamic.transport.compress": "runs workers and writes files",
-    "systems.dynamic.transport.clustering": "counts",
-    "systems.devices": "puts arrays on devices",
-    "systems.protocol": "calls the methods of systems; tests/systems/test_protocol.py holds these",
-    "systems.bounces.tensor.light_side": "takes half precision; tests/systems/test_protocol.py has scenes",
-    "systems.bounces.tensor.collect": "takes half precision; the same",
-    "systems.lobe.em": "the steps of lobe.tabulate, and tested through it",
-    "systems.separable.factorization.light_errors": "draws its own directions",
-    "systems.separable.factorization.tabulate": "checks values",
-    "image.arguments": "checks values",
-    "scene.origin": "NumPy in float64, where data enters",
-    "scene.camera.localize": "moves a mesh on the host",
-    "scene.camera.in_common_coordinates": "decorates functions",
-    "scene.scene.centered": "moves a scene on the host",
-    "visibility.starts": "traces rays",
-    "scene.mesh": "loads, checks and builds meshes",
-    "scene.formats": "reads files",
-    "scene.scene.unique_names": "names",
-    "scene.scene.default_camera": "measures a mesh on the host",
-    "scene.material.opacity_of_parts": "joins images on the host",
-    "scene.texture.dpdu": "reads a mesh on the host",
-    "scene.texture.handedness": "the same",
-    "scene.occluder": "simplifies meshes on the host",
-    "scene.subdivision": "divides meshes on the host",
-    "scene.light_samples": "NumPy on the host",
-    "scene.builtin": "builds meshes and lights",
-    "benchmarks.published.interiors": "builds meshes",
-    "scene.camera.orbit": "measures a mesh on the host",
-    "scene.environment.load_environment": "reads a file",
-    "scene.environment.environment_from_image": "checks values",
-    "scene.environment.layout_of": "reads the shape of an image file",
-    "scene.environment.resample": "NumPy in float64, where data enters",
-    "scene.panorama": "pixels of files, NumPy on the host",
-    "scene.panorama_loops": "the same, by numba",
-    "scene.environment.finer": "the same; the light itself without a file",
-    "scene.environment.add_disk": "NumPy on the host",
-    "scene.environment.disk_share": "the same",
-    "scene.environment.resized": "the same; tests/scene/test_environment.py",
-    "systems.harmonic.exported": "NumPy on the host; tests/view/test_piece.py",
-    "systems.lobe.exported": "the same",
-    "systems.lobe.pyramid.from_bits": "cuts bytes",
-    "scene.environment.sky": "the same; environment.background without a file",
-    "image.metrics.flip": "calls the reference implementation",
-    "sphere.cubemap.border_index": "a NumPy table of indices",
-    "sphere.harmonics.degree_of": "arithmetic on shapes",
-    "sphere.harmonics.basis": "by NumPy or JAX, as its first argument says; evaluate is the function",
-    "sphere.harmonics.quadrature": "NumPy tables",
-    "scene.light_probes.irradiance": "checks values; its pure part is sphere.low_frequency.irradiance",
-    "sphere.haar.face_edge": "arithmetic on shapes",
+# By reason: public functions, and modules of them, that the rules below do not hold for.
+REASONS = {
+    "checks values, or chooses by them": """
+        require scene.points.on_triangles benchmarks.published.factorization benchmarks.published.lobes.mirror_lobes
+        require.finite require.length systems.harmonic.transfer.check systems.harmonic.transfer.check_memory
+        brdf.measured.require brdf.measured.check_unique brdf.measured.one_of brdf.models.color brdf.models.scalar
+        systems.harmonic.table.tabulate systems.separable.factorization.check_mark
+        systems.separable.factorization.factor systems.lobe.table.tabulate systems.lobe.table.brdf_samples
+        systems.lobe.table.is_isotropic systems.dynamic.reflected.reflect systems.dynamic.reflected.check_values
+        systems.bounces.functions.shared brdf.places.in_columns brdf.navigation.blinn_phong
+        systems.dynamic.table.tabulate systems.separable.factorization.tabulate image.arguments
+        scene.camera.in_common_coordinates scene.environment.environment_from_image scene.light_probes.irradiance
+    """,
+    "takes functions": "compile",
+    "reads or writes files, or runs workers": """
+        programs cli brdf.fitted view files visibility.blocks systems.separable.clustered.precompute
+        systems.harmonic.exchange brdf.scattered brdf.measured.load_merl brdf.measured.load_npf
+        brdf.navigation.cook_torrance systems.dynamic.transport.compress scene.mesh scene.formats
+        scene.environment.load_environment scene.environment.layout_of
+    """,
+    "NumPy, or values or types that are looked at, on the host": """
+        inverse scene.texture.unit_normals scene.sides image.pixels.sky image.pixels.pixel_angle systems.axes
+        systems.ranges systems.lobe.system.matte_transport systems.lobe.pyramid.compress systems.lobe.pyramid.dither
+        systems.lamps.places systems.bounces.traced.is_sharp systems.bounces.traced.is_traced visibility.members.cluster
+        visibility.members.coordinates systems.bright_texels.samples_for decompose.clustering
+        decompose.eigen.orientation decompose.tucker.orient systems.separable.factorization.mark_of
+        systems.dynamic.reflected.stacked systems.bounces.gather.shares systems.bounces.gather.cosines
+        systems.bounces.gather.measures systems.bounces.patches.divide brdf.places.columns scene.origin
+        scene.camera.localize scene.scene.centered scene.scene.default_camera scene.material.opacity_of_parts
+        scene.texture.dpdu scene.texture.handedness scene.occluder scene.subdivision scene.light_samples scene.builtin
+        benchmarks.published.interiors scene.camera.orbit scene.environment.resample scene.panorama scene.panorama_loops
+        scene.environment.finer scene.environment.add_disk scene.environment.disk_share scene.environment.resized
+        systems.harmonic.exported systems.lobe.exported scene.environment.sky
+    """,
+    "traces rays": """
+        relit visibility.picture_rays image.pixels.visible_points image.pixels.coverage image.pixels.nearest_fragments
+        visibility.rays visibility.occluder visibility.embree visibility.picture_loops visibility.refinement
+        systems.separable.sparse.precompute benchmarks.published.interreflection visibility.stored.precompute
+        systems.lobe.pyramid.precompute systems.lamps.transport systems.harmonic.transfer.precompute
+        systems.harmonic.transfer.precompute_diffuse systems.reference.radiance systems.bounces.gather.rays
+        systems.bounces.build.precompute systems.bounces.patches.exchange systems.bounces.jobs
+        systems.dynamic.transport.precompute visibility.starts
+    """,
+    "takes parts; what they look like at points is in tests/scene/test_material_table.py": "scene.material_table",
+    "gives numbers or names, or as many results as the size says": """
+        scene.texture.mipmap systems.lobe.blurred_light.blur sphere.hats.count systems.lobe.diffuse.cells
+        systems.lobe.diffuse.count visibility.members.clusters_for systems.separable.sparse.rms
+        systems.lobe.table.measured_error systems.bounces.tensor.twice systems.dynamic.transport.clustering
+        scene.scene.unique_names sphere.harmonics.degree_of sphere.haar.face_edge
+    """,
+    "gives numbers of texels": "scene.texture.bilinear",
+    "takes numbers of triangles; tests/image/test_pixels.py": "image.raster.barycentric",
+    "clamps; tests/scene/test_texture.py has SciPy's answers": """
+        scene.texture.tilt_normals scene.texture.normal_variance scene.texture.widen_roughness
+    """,
+    "a NumPy table, or an index in one": """
+        sphere.hats.centers sphere.hats.table sphere.hats.inverse_gram systems.lobe.pyramid.scales
+        systems.lobe.pyramid.between systems.lobe.pyramid.corners systems.lobe.blurred_light.scales
+        visibility.members.places sphere.cubemap.axes brdf.measured.cell_angles brdf.measured.lower_cosine
+        brdf.measured.tabulate sphere.cubemap.border_index sphere.harmonics.quadrature
+    """,
+    "gives truth values": """
+        image.raster.front image.raster.front_faces image.pixels.seen_from_front brdf.models.both_above
+    """,
+    "by NumPy or JAX, as the last argument says; image.tonemap.display is the function": "image.tonemap.apply_curve",
+    "has more padding in jit than outside; tests/image/test_pixels.py": "image.pixels.shading_points",
+    "takes an index": "benchmarks.published.lobes.SetMember",
+    "takes half precision; tests/figures/test_transfer.py": "benchmarks.published.transfer",
+    "gives vectors of either sign": """
+        benchmarks.published.tensors.hooi decompose.tucker.hosvd decompose.tucker.truncated decompose.tucker.dominant
+    """,
+    "takes or gives bytes or half precision": """
+        systems.lobe.diffuse.vectors systems.lobe.diffuse.harmonics_of systems.lobe.pyramid.bits
+        systems.lobe.pyramid.pyramid systems.separable.clustered.compress systems.lobe.pyramid.from_bits
+        systems.lobe.pyramid.texel_bits
+    """,
+    "takes indices, frames and shares; bright_texels.radiance has them all": "systems.bright_texels.texel_radiance",
+    "takes unit normals; tests/systems/lobe/test_diffuse.py": "systems.lobe.diffuse.flux",
+    "takes points; tests/systems/lobe/test_diffuse.py": "systems.lobe.diffuse.at_points",
+    "gives indices beside weights, compiled in steps; combine has them all": "systems.lobe.system.view_lobes",
+    "views and sums of systems; tests/systems/lobe/test_widened.py": "systems.lobe.widened",
+    "a step of ReflectingPart; tests/systems/bounces/test_traced.py": """
+        systems.bounces.traced.lookup systems.bounces.traced.harmonics_of systems.bounces.traced.quantiles
+        systems.bounces.traced.weights
+    """,
+    "reads files, on the host; the rest fits what is in them": "systems.standard",
+    "integrates cells that a loop chooses; reference.integrate has them all": "systems.adaptive",
+    "one formula for NumPy and JAX arrays": "brdf.coat.coat_reflectance",
+    "tested through the models": "brdf.models.half_vector",
+    "gives indices beside weights; tested through the tables that are read by it": "brdf.grid",
+    "counts colors by values": "systems.bounces.functions.basis systems.bounces.functions.fixed_weights",
+    "gives its argument; tested through the places": "brdf.places.identity",
+    "by SciPy, where data enters": "brdf.places.triangulate",
+    "empty arrays": "systems.dynamic.table.without_tensor",
+    "puts arrays on devices": "systems.devices",
+    "calls the methods of systems; tests/systems/test_protocol.py holds these": "systems.protocol",
+    "takes half precision; tests/systems/test_protocol.py has scenes": "systems.bounces.tensor.light_side",
+    "takes half precision; the same": "systems.bounces.tensor.collect",
+    "the steps of lobe.tabulate, and tested through it": "systems.lobe.em",
+    "draws its own directions": "systems.separable.factorization.light_errors",
+    "calls the reference implementation": "image.metrics.flip",
+    "by NumPy or JAX, as its first argument says; evaluate is the function": "sphere.harmonics.basis",
 }
+HOST = {name: reason for reason, names in REASONS.items() for name in names.split()}
 
 
 class Draw:
@@ -422,6 +324,11 @@ def example(build, /, *, gradient=None, batch=True, **options):
     return Example(build, gradient, batch, options)
 
 
+def model(build, /, **options):
+    """One line of the table, for a BRDF at five pairs of directions."""
+    return example(lambda draw: call(build(draw), draw.upper(5), draw.upper(5)), **options)
+
+
 def nothing(draw):
     """No arrays: the function makes a table."""
     return call()
@@ -519,155 +426,86 @@ EXAMPLES = {
         lambda draw: call(draw.light(), (Sun("sun", draw.unit(1)[0], draw.uniform(3)),)), gradient=("light",)
     ),
     "scene.environment.background": example(lambda draw: call(draw.light(), draw.normal(5, 3))),
-    "brdf.coat.ClearCoat": example(
-        lambda draw: call(
-            brdf.ClearCoat(
-                brdf.MetallicRoughness(draw.uniform(3), draw.uniform(), draw.uniform()), draw.uniform(), draw.uniform()
-            ),
-            draw.upper(5),
-            draw.upper(5),
-        ),
+    "brdf.coat.ClearCoat": model(
+        lambda draw: brdf.ClearCoat(
+            brdf.MetallicRoughness(draw.uniform(3), draw.uniform(), draw.uniform()), draw.uniform(), draw.uniform()
+        )
     ),
-    "brdf.coat.CoatedModel": example(
-        lambda draw: call(
-            brdf.CoatedModel(brdf.GGX(draw.uniform(3), draw.uniform(2)), transmits=True), draw.upper(5), draw.upper(5)
-        ),
+    "brdf.coat.CoatedModel": model(
+        lambda draw: brdf.CoatedModel(brdf.GGX(draw.uniform(3), draw.uniform(2)), transmits=True)
     ),
-    "brdf.sheen.Charlie": example(lambda draw: call(brdf.Charlie(draw.uniform()), draw.upper(5), draw.upper(5))),
-    "brdf.sheen.UnderSheen": example(
-        lambda draw: call(
-            brdf.UnderSheen(brdf.GGX(draw.uniform(3), draw.uniform(2)), draw.uniform()), draw.upper(5), draw.upper(5)
-        ),
+    "brdf.sheen.Charlie": model(lambda draw: brdf.Charlie(draw.uniform())),
+    "brdf.sheen.UnderSheen": model(
+        lambda draw: brdf.UnderSheen(brdf.GGX(draw.uniform(3), draw.uniform(2)), draw.uniform())
     ),
     "brdf.sheen.sheen_albedo": example(lambda draw: call(draw.uniform(5), draw.uniform(5))),
-    "brdf.sheen.Sheen": example(
-        lambda draw: call(
-            brdf.Sheen(
-                brdf.MetallicRoughness(draw.uniform(3), draw.uniform(), draw.uniform()), draw.uniform(3), draw.uniform()
-            ),
-            draw.upper(5),
-            draw.upper(5),
-        ),
-    ),
-    "brdf.models.Lambert": example(
-        lambda draw: call(brdf.Lambert(draw.uniform(3)), draw.upper(5), draw.upper(5)),
-        gradient=("self",),  # The value is the same for all directions.
-    ),
-    "brdf.models.AshikhminShirley": example(
-        lambda draw: call(
-            brdf.AshikhminShirley(draw.uniform(3), draw.uniform(3), 10.0, 60.0), draw.upper(5), draw.upper(5)
+    "brdf.sheen.Sheen": model(
+        lambda draw: brdf.Sheen(
+            brdf.MetallicRoughness(draw.uniform(3), draw.uniform(), draw.uniform()), draw.uniform(3), draw.uniform()
         )
     ),
-    "brdf.measured.HalfDifferenceTable": example(
-        lambda draw: call(
-            brdf.measured.HalfDifferenceTable(draw.uniform(5, 4, 6, 3), draw.uniform()), draw.upper(5), draw.upper(5)
+    "brdf.models.Lambert": model(lambda draw: brdf.Lambert(draw.uniform(3)), gradient=("self",)),
+    "brdf.models.AshikhminShirley": model(
+        lambda draw: brdf.AshikhminShirley(draw.uniform(3), draw.uniform(3), 10.0, 60.0)
+    ),
+    "brdf.measured.HalfDifferenceTable": model(
+        lambda draw: brdf.measured.HalfDifferenceTable(draw.uniform(5, 4, 6, 3), draw.uniform())
+    ),
+    "brdf.measured.MicrofacetTable": model(
+        lambda draw: brdf.measured.MicrofacetTable(
+            *(draw.uniform(*shape) for shape in ((3,), (3,), (7, 3), (5, 3), (6, 3)))
         )
     ),
-    "brdf.measured.MicrofacetTable": example(
-        lambda draw: call(
-            brdf.measured.MicrofacetTable(*(draw.uniform(*shape) for shape in ((3,), (3,), (7, 3), (5, 3), (6, 3)))),
-            draw.upper(5),
-            draw.upper(5),
+    "brdf.models.Phong": model(lambda draw: brdf.Phong(draw.uniform(3), draw.uniform(1), 8.0)),
+    "brdf.models.BlinnPhong": model(lambda draw: brdf.BlinnPhong(draw.uniform(3), draw.uniform(1), 20.0)),
+    "brdf.models.Ward": model(lambda draw: brdf.Ward(draw.uniform(3), draw.uniform(1), 0.4, 0.7)),
+    "brdf.models.WardDuer": model(lambda draw: brdf.WardDuer(draw.uniform(3), draw.uniform(1), 0.4, 0.7)),
+    "brdf.models.CookTorrance": model(
+        lambda draw: brdf.CookTorrance(draw.uniform(3), draw.uniform(1), 0.5, draw.uniform(3))
+    ),
+    "brdf.models.Lafortune": model(
+        lambda draw: brdf.Lafortune(
+            draw.uniform(3),
+            *(draw.array(sign * np.asarray(draw.uniform(2, 3))) for sign in (-1, -1, 1)),
+            [[5.0], [2.0]],
         )
     ),
-    "brdf.models.Phong": example(
-        lambda draw: call(brdf.Phong(draw.uniform(3), draw.uniform(1), 8.0), draw.upper(5), draw.upper(5))
+    "brdf.varying.PerVertex": model(
+        lambda draw: PerVertex(brdf.Phong(draw.uniform(5, 3), draw.uniform(5, 3), draw.uniform(5, 1)))
     ),
-    "brdf.models.BlinnPhong": example(
-        lambda draw: call(brdf.BlinnPhong(draw.uniform(3), draw.uniform(1), 20.0), draw.upper(5), draw.upper(5))
+    "brdf.varying.Channels": model(
+        lambda draw: Channels((brdf.Phong(draw.uniform(1)), brdf.Lambert(draw.uniform(1))), draw.uniform(2))
     ),
-    "brdf.models.Ward": example(
-        lambda draw: call(brdf.Ward(draw.uniform(3), draw.uniform(1), 0.4, 0.7), draw.upper(5), draw.upper(5))
+    "brdf.microfacet.GGX": model(lambda draw: brdf.GGX(draw.uniform(3), draw.uniform(2), draw.uniform())),
+    "brdf.microfacet.GGXInterface": model(
+        lambda draw: brdf.GGXInterface(draw.uniform(3), draw.uniform(3), draw.uniform(2))
     ),
-    "brdf.models.WardDuer": example(
-        lambda draw: call(brdf.WardDuer(draw.uniform(3), draw.uniform(1), 0.4, 0.7), draw.upper(5), draw.upper(5))
-    ),
-    "brdf.models.CookTorrance": example(
-        lambda draw: call(
-            brdf.CookTorrance(draw.uniform(3), draw.uniform(1), 0.5, draw.uniform(3)), draw.upper(5), draw.upper(5)
+    "brdf.microfacet.SchlickDiffuse": model(lambda draw: brdf.SchlickDiffuse(draw.uniform(3))),
+    "brdf.microfacet.MetallicRoughness": model(
+        lambda draw: brdf.MetallicRoughness(
+            draw.uniform(5, 3), *(draw.uniform(5) for _ in range(4)), draw.uniform(3), draw.uniform(5), draw.uniform()
         )
     ),
-    "brdf.models.Lafortune": example(
-        lambda draw: call(
-            brdf.Lafortune(
-                draw.uniform(3),
-                *(draw.array(sign * np.asarray(draw.uniform(2, 3))) for sign in (-1, -1, 1)),
-                [[5.0], [2.0]],
-            ),
-            draw.upper(5),
-            draw.upper(5),
-        )
+    "brdf.cylinders.PoulinFournier": model(
+        lambda draw: brdf.PoulinFournier(draw.uniform(3), draw.uniform(1), 20.0, 2.5, 0.3)
     ),
-    "brdf.varying.PerVertex": example(
-        lambda draw: call(
-            PerVertex(brdf.Phong(draw.uniform(5, 3), draw.uniform(5, 3), draw.uniform(5, 1))),
-            draw.upper(5),
-            draw.upper(5),
-        ),
+    "brdf.cylinders.PoulinFournierGrooves": model(
+        lambda draw: brdf.PoulinFournierGrooves(draw.uniform(3), draw.uniform(1), 20.0, 2.5, 0.3)
     ),
-    "brdf.varying.Channels": example(
-        lambda draw: call(
-            Channels((brdf.Phong(draw.uniform(1)), brdf.Lambert(draw.uniform(1))), draw.uniform(2)),
-            draw.upper(5),
-            draw.upper(5),
-        ),
-    ),
-    "brdf.microfacet.GGX": example(
-        lambda draw: call(brdf.GGX(draw.uniform(3), draw.uniform(2), draw.uniform()), draw.upper(5), draw.upper(5))
-    ),
-    "brdf.microfacet.GGXInterface": example(
-        lambda draw: call(
-            brdf.GGXInterface(draw.uniform(3), draw.uniform(3), draw.uniform(2)), draw.upper(5), draw.upper(5)
-        )
-    ),
-    "brdf.microfacet.SchlickDiffuse": example(
-        lambda draw: call(brdf.SchlickDiffuse(draw.uniform(3)), draw.upper(5), draw.upper(5))
-    ),
-    "brdf.microfacet.MetallicRoughness": example(
-        lambda draw: call(
-            brdf.MetallicRoughness(
-                draw.uniform(5, 3),
-                *(draw.uniform(5) for _ in range(4)),
-                draw.uniform(3),
-                draw.uniform(5),
-                draw.uniform(),
-            ),
-            draw.upper(5),
-            draw.upper(5),
-        )
-    ),
-    "brdf.cylinders.PoulinFournier": example(
-        lambda draw: call(
-            brdf.PoulinFournier(draw.uniform(3), draw.uniform(1), 20.0, 2.5, 0.3), draw.upper(5), draw.upper(5)
-        )
-    ),
-    "brdf.cylinders.PoulinFournierGrooves": example(
-        lambda draw: call(
-            brdf.PoulinFournierGrooves(draw.uniform(3), draw.uniform(1), 20.0, 2.5, 0.3), draw.upper(5), draw.upper(5)
-        )
-    ),
-    "systems.separable.factorization.SeparableBrdf": example(
-        lambda draw: call(draw.separable(), draw.upper(5), draw.upper(5)),
-    ),
+    "systems.separable.factorization.SeparableBrdf": model(lambda draw: draw.separable()),
     # Cosines are clipped to [-1, 1], which a direction's own reaches: a table, of no use to derivatives.
     "systems.separable.factorization.light_covariance": example(lambda draw: call(draw.unit(4)), gradient=(), degree=6),
-    "systems.harmonic.table.HarmonicBrdf": example(lambda draw: call(draw.harmonic(), draw.upper(5), draw.upper(5))),
-    "systems.lobe.table.LobeBrdf": example(lambda draw: call(draw.lobes(), draw.upper(5), draw.upper(5))),
+    "systems.harmonic.table.HarmonicBrdf": model(lambda draw: draw.harmonic()),
+    "systems.lobe.table.LobeBrdf": model(lambda draw: draw.lobes()),
     "systems.bounces.traced.albedos": example(lambda draw: call(draw.lobes())),
-    "systems.dynamic.table.DynamicBrdf": example(lambda draw: call(draw.tensor(), draw.upper(5), draw.upper(5))),
+    "systems.dynamic.table.DynamicBrdf": model(lambda draw: draw.tensor()),
     "systems.dynamic.transport.light_factors": example(lambda draw: call(draw.tensor())),
     "systems.bounces.functions.albedo": example(lambda draw: call(draw.separable())),
     "systems.bounces.functions.project": example(lambda draw: call(draw.separable()), degree=2),
-    "benchmarks.published.lobes.BrdfSet": example(
-        lambda draw: call(
-            BrdfSet.of([brdf.Phong(draw.uniform(1), draw.uniform(1), exponent) for exponent in (4.0, 9.0)]),
-            draw.upper(5),
-            draw.upper(5),
-        ),
+    "benchmarks.published.lobes.BrdfSet": model(
+        lambda draw: BrdfSet.of([brdf.Phong(draw.uniform(1), draw.uniform(1), exponent) for exponent in (4.0, 9.0)])
     ),
-    "benchmarks.published.lobes.Remainder": example(
-        lambda draw: call(Remainder(brdf.Lambert(draw.uniform(3)), draw.lobes()), draw.upper(5), draw.upper(5)),
-    ),
+    "benchmarks.published.lobes.Remainder": model(lambda draw: Remainder(brdf.Lambert(draw.uniform(3)), draw.lobes())),
     "systems.harmonic.table.project": example(
         lambda draw: call(brdf.AshikhminShirley(draw.uniform(3), draw.uniform(3), 10.0, 60.0), draw.upper(5)),
         degree=2,
@@ -680,8 +518,7 @@ EXAMPLES = {
     "image.raster.rasterize": example(lambda draw: call(draw.mesh(), draw.camera()), gradient=()),
     "image.raster.project": example(lambda draw: call(draw.mesh().position, draw.camera())),
     "image.pixels.interpolate": example(
-        lambda draw: call(draw.fragments(), draw.mesh().face, draw.normal(6, 2)),
-        gradient=("attribute",),
+        lambda draw: call(draw.fragments(), draw.mesh().face, draw.normal(6, 2)), gradient=("attribute",)
     ),
     "image.pixels.by_color": example(lambda draw: call(draw.normal(7, 3)), colors=1),
     "image.pixels.resolve": example(
@@ -699,9 +536,7 @@ EXAMPLES = {
     "image.tonemap.encode_srgb": example(lambda draw: call(draw.uniform(20, low=-0.01, high=1))),
     "image.tonemap.decode_srgb": example(lambda draw: call(draw.uniform(20, low=-0.01, high=1))),
     "image.tonemap.display": example(lambda draw: call(draw.uniform(20, low=-0.01, high=2)), tone="filmic"),
-    "systems.separable.sparse.project": example(
-        lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable()),
-    ),
+    "systems.separable.sparse.project": example(lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable())),
     "systems.separable.sparse.compress": example(
         lambda draw: call(draw.seen(2), draw.rotation(2), draw.separable()), keep=5
     ),
@@ -713,8 +548,7 @@ EXAMPLES = {
         lambda draw: call(draw.lamps(), draw.rotation(2), draw.separable()), gradient=("basis",)
     ),
     "systems.bounces.gather.respond_again": example(
-        lambda draw: call(draw.normal(4, 3, 2), draw.rotation(2), draw.separable()),
-        gradient=("arriving", "basis"),
+        lambda draw: call(draw.normal(4, 3, 2), draw.rotation(2), draw.separable()), gradient=("arriving", "basis")
     ),
     "systems.bounces.gather.arrive": example(
         lambda draw: call(
@@ -858,7 +692,7 @@ EXAMPLES = {
     ),
     "systems.separable.system.light_tuple": example(lambda draw: call(draw.sparse(), draw.light())),
     "systems.separable.system.view_tuple": example(
-        lambda draw: call(draw.separable(), (mesh := draw.sparse()).position, mesh.frame, draw.above(mesh)),
+        lambda draw: call(draw.separable(), (mesh := draw.sparse()).position, mesh.frame, draw.above(mesh))
     ),
     "systems.separable.system.combine": example(lambda draw: call(draw.normal(4, 2, 1), draw.normal(4, 2, 3))),
 }
@@ -951,7 +785,7 @@ def is_batched(name: str) -> bool:
 
 def test_every_pure_function_has_an_example():
     missing = [name for name in PURE if name not in EXAMPLES]
-    assert not missing, f"add {missing} to EXAMPLES, or to HOST with the reason"
+    assert not missing, f"add {missing} to EXAMPLES, or to REASONS"
 
 
 def test_every_example_and_every_exception_is_of_something_public():
@@ -1094,7 +928,7 @@ def check_dtype(arrays, result, dtype):
     assert all(leaf.dtype == dtype for leaf in floats(arrays)), "the example itself must have the dtype"
     result = floats(result)
     assert [leaf.dtype for leaf in result] == [dtype] * len(result)
-    assert result, "a function without floating-point results is for HOST"
+    assert result, "a function without floating-point results is for REASONS"
 
 
 def test_gradient_equals_finite_differences(hold, x64):

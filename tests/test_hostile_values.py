@@ -363,12 +363,7 @@ def scene_verbs() -> dict[str, Verb]:
             prt.view.export_gltf, scene=ready, path="x.glb", environments={"one": environment()}, degree=2
         ),
         "view.export_baked": Verb(
-            prt.view.export_baked,
-            scene=ready,
-            path="x.glb",
-            environment=environment(),
-            eye=EYE,
-            materials=None,
+            prt.view.export_baked, scene=ready, path="x.glb", environment=environment(), eye=EYE, materials=None
         ),
         "inverse.observe": Verb(
             prt.inverse.observe, mesh=mesh(), pictures=[prt.inverse.Picture(np.ones((8, 8, 3)), camera())]

@@ -71,10 +71,6 @@ def execute(path: pathlib.Path) -> None:
             plt.close("all")
 
 
-def test_there_are_notebooks():
-    assert NOTEBOOKS
-
-
 # The size may cause warnings. The outputs of full size hold none.
 @pytest.mark.filterwarnings("default", "ignore:Implicitly cleaning up:ResourceWarning")  # the folders of a notebook
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
@@ -92,40 +88,19 @@ def test_a_cell_that_fails_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
-def test_a_notebook_is_small(path):
+def test_a_notebook_is_small_and_readable_without_a_kernel_as_it_is_committed(path):
+    """Of one run from the top, with pictures, without errors, warnings, widgets or folders of some machine."""
     assert path.stat().st_size <= LARGEST
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
-def test_outputs_are_of_one_run_from_the_top(path):
-    code = _code(path)
+    notebook, code = json.loads(path.read_text()), _code(path)
+    assert notebook["metadata"]["kernelspec"]["name"] == "python3"
+    assert "widgets" not in notebook["metadata"]
     assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
-    pictures = [output for cell in code for output in cell["outputs"] if "image/jpeg" in output.get("data", {})]
-    assert pictures
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
-def test_outputs_hold_neither_errors_nor_warnings(path):
-    outputs = [output for cell in _code(path) for output in cell["outputs"]]
+    outputs = [output for cell in code for output in cell["outputs"]]
     assert not [output for output in outputs if output["output_type"] == "error" or output.get("name") == "stderr"]
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
-def test_outputs_need_no_kernel(path):
-    assert "widgets" not in json.loads(path.read_text())["metadata"]
-    shown = [kind for cell in _code(path) for output in cell["outputs"] for kind in output.get("data", {})]
+    shown = [kind for output in outputs for kind in output.get("data", {})]
+    assert "image/jpeg" in shown
     assert not [kind for kind in shown if "widget" in kind]
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
-def test_a_notebook_names_no_folder_of_a_machine(path):
-    found = [match.group() for text in _texts(json.loads(path.read_text())) for match in MACHINE.finditer(text)]
-    assert not found
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
-def test_a_notebook_runs_on_the_kernel_that_every_machine_has(path):
-    assert json.loads(path.read_text())["metadata"]["kernelspec"]["name"] == "python3"
+    assert not [match.group() for text in _texts(notebook) for match in MACHINE.finditer(text)]
 
 
 @pytest.mark.parametrize(

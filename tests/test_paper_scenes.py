@@ -6,7 +6,6 @@ import pytest
 from benchmarks import paper_figures, paper_scenes, path_tracing
 from jaxprt import bounces, image
 from jaxprt.relit import paths
-from jaxprt.scene import builtin
 from jaxprt.sphere import cubemap
 from jaxprt.systems import standard
 
@@ -74,15 +73,6 @@ def test_a_white_surface_that_faces_the_lamp_has_a_radiance_of_one_more_than_the
     weight = np.maximum(cosine, 0) * np.asarray(cubemap.solid_angle(size=size))
     irradiance = np.sum(weight[..., None] * np.asarray(light.radiance), (0, 1, 2))
     np.testing.assert_allclose(irradiance / np.pi, 1.2, rtol=0.01)
-
-
-def test_light_in_blocks_has_the_flux_of_the_light_and_few_values():
-    light = builtin.studio(size=16)
-    coarse = paper_figures.blocks(light, 4)
-    area = np.asarray(cubemap.solid_angle(size=16))[..., None]
-    flux = [np.sum(area * np.asarray(each.radiance), (0, 1, 2)) for each in (light, coarse)]
-    np.testing.assert_allclose(flux[1], flux[0], rtol=1e-5)
-    assert len(np.unique(np.asarray(coarse.radiance)[..., 0])) <= 6 * 4 * 4
 
 
 def test_pictures_fade_into_white_at_edges_also_where_they_are_brighter_than_the_screen():

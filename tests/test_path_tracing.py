@@ -1,5 +1,6 @@
 """The path tracer that judges interreflection is itself judged: its camera, its material, its direct light."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -70,6 +71,9 @@ def plugin():
     return make
 
 
+evaluate = jax.jit(lambda material, wi, wo: material(wi, wo))
+
+
 def hemisphere():
     """Directions and solid angles: Gauss's nodes in the cosine, even steps around."""
     node, weight = np.polynomial.legendre.leggauss(200)
@@ -85,21 +89,13 @@ def inclined(angle):
 
 @pytest.mark.parametrize("material", SHARP)
 @pytest.mark.parametrize("angle", [0.02, 1.0, 1.4])
-def test_material_is_that_of_jaxprt(plugin, material, angle):
-    wo, _ = hemisphere()
-    mitsuba, bsdf, seen = plugin(material, inclined(angle))
-    actual = np.array(bsdf.eval(mitsuba.BSDFContext(), seen, mitsuba.Vector3f(wo.T))).T
-    expected = material(jnp.asarray(wo), jnp.broadcast_to(inclined(angle), wo.shape)) * wo[:, 2:]
-    assert np.linalg.norm(actual - expected) < 1e-4 * np.linalg.norm(expected)
-
-
-@pytest.mark.parametrize("material", SHARP)
-@pytest.mark.parametrize("angle", [0.02, 1.0, 1.4])
-def test_samples_follow_their_density_and_weigh_the_albedo(plugin, material, angle):
+def test_material_is_that_of_jaxprt_and_samples_follow_its_density(plugin, material, angle):
+    wo, area = hemisphere()
     mitsuba, bsdf, seen = plugin(material, inclined(angle))
     context = mitsuba.BSDFContext()
-    wo, area = hemisphere()
-    value, density = (np.array(x) for x in bsdf.eval_pdf(context, seen, mitsuba.Vector3f(wo.T)))
+    actual, density = (np.array(x) for x in bsdf.eval_pdf(context, seen, mitsuba.Vector3f(wo.T)))
+    expected = np.asarray(evaluate(material, wo, np.broadcast_to(inclined(angle), wo.shape))) * wo[:, 2:]
+    assert np.linalg.norm(actual.T - expected) < 1e-4 * np.linalg.norm(expected)
     random = np.random.default_rng(0).random((3, 1 << 18), np.float32)
     drawn, weight = bsdf.sample(context, seen, mitsuba.Float(random[0]), mitsuba.Point2f(random[1:]))
     direction, weight = np.array(drawn.wo), np.array(weight)
@@ -107,7 +103,7 @@ def test_samples_follow_their_density_and_weigh_the_albedo(plugin, material, ang
     # Some four standard errors each: the share above the horizon, the mean direction, the albedo.
     assert abs(density @ area - above.mean()) < 2e-3
     np.testing.assert_allclose((direction * above).mean(1), wo.T @ (density * area), atol=4e-3)
-    np.testing.assert_allclose(weight.mean(1), value @ area, rtol=6e-3)
+    np.testing.assert_allclose(weight.mean(1), actual @ area, rtol=6e-3)
 
 
 def test_no_sample_of_a_metal_weighs_more_than_its_color_at_grazing_angles(plugin):
@@ -199,22 +195,11 @@ def test_bounces_only_add_light_and_less_each_time(scene, camera, light):
     assert 0 < three - two < 0.5 * (two - one)
 
 
-def test_same_seed_gives_the_same_picture(scene, camera, light):
-    one, same, other = (
-        path_tracing.picture(scene, MATERIALS, light, camera, depth=3, samples=4, seed=seed) for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(one, same)
-    assert np.any(one != other)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"materials": MATERIALS[:1]}, "materials must have one for each region, got 1 and region 1"),
-        (
-            {"materials": [MATERIALS[0], None]},
-            "materials must be CookTorrance, .* or PerVertex, got NoneType",
-        ),
+        ({"materials": [MATERIALS[0], None]}, "materials must be CookTorrance, .* or PerVertex, got NoneType"),
         ({"light": Environment(jnp.ones((2, 6, 4, 4, 3)))}, r"light must be one environment, got a batch \[2\]"),
         ({"depth": 1}, "depth must be at least 2 and samples at least 1, got 1 and 4"),
         ({"samples": 0}, "depth must be at least 2 and samples at least 1, got 2 and 0"),

@@ -10,11 +10,6 @@ import pytest
 from jaxprt import require
 
 
-@pytest.mark.parametrize("value", [1.0, 3, np.ones((2, 3)), jnp.zeros(4), np.array([1, 2]), np.zeros(0)])
-def test_finite_values_pass(value):
-    require.finite("the eye", value)
-
-
 def test_the_message_counts_and_names_the_first_value_that_is_not_finite():
     with pytest.raises(
         ValueError, match=r"the eye must be finite, got 2 of 6 values that are not, first at \(0, 2\): inf"
@@ -35,7 +30,7 @@ def test_values_below_a_bound_are_refused_by_name():
         require.at_least("the albedo", np.nan, 0.0)
 
 
-@pytest.mark.parametrize("shape", [(), (1,), (4,), (3, 1), (2, 3)])
+@pytest.mark.parametrize("shape", [(), (4,), (3, 1)])
 def test_a_position_has_three_values_also_where_they_are_traced(shape):
     require.position("the eye", [1, 2, 3])
     with pytest.raises(

@@ -6,14 +6,10 @@ import numpy as np
 import pytest
 
 from jaxprt.brdf import BlinnPhong, PoulinFournier, PoulinFournierGrooves
+from tests.upper import evaluate
 
 SAMPLES = 20000  # along each part of a profile
 TRACED_TOLERANCE = 1e-3  # Of the traced integral: it counts samples, and some are at the limits of what is seen.
-
-
-@jax.jit
-def evaluate(model, wi, wo):
-    return model(wi, wo)
 
 
 def _pairs(count, seed=0):
@@ -126,19 +122,6 @@ def test_without_cylinders_the_surface_is_its_material(kind, height, exponent, x
     material = BlinnPhong(0.4, [0.6, 0.2, 0.1], exponent)
     found = evaluate(kind(0.4, [0.6, 0.2, 0.1], exponent, 2.0, height), wi, wo)
     close(found, evaluate(material, wi, wo), tolerance=1e-6)  # a strip of 1e-7 is left of the cylinders
-
-
-def test_half_cylinders_seen_and_lit_from_above_are_dimmer_than_their_material_by_a_quarter_of_pi(x64):
-    up = jnp.array([0.0, 0, 1])
-    for kind in (PoulinFournier, PoulinFournierGrooves):
-        assert evaluate(kind(0.8, 0.0, 1.0, 2.0, 0.0), up, up)[0] == pytest.approx(0.8 / 4, rel=1e-8)
-
-
-@pytest.mark.parametrize("height", [-0.6, 0.0, 0.4])
-def test_cylinders_that_touch_are_the_limit_of_both_sides(height, x64, close):
-    wi, wo = jnp.asarray(_pairs(300))
-    apart, together = (PoulinFournier(0.4, 0.6, 30.0, 2.0 + step, height) for step in (1e-7, -1e-7))
-    close(evaluate(apart, wi, wo), evaluate(together, wi, wo), tolerance=1e-3)  # sqrt(1e-7), the edge's arcus
 
 
 def test_float32_keeps_the_value(close):

@@ -1,26 +1,13 @@
 """Fits read from files: the models that they state, and what is refused."""
 
 import json
-import os
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxprt.brdf import load_lafortune, load_ngan, load_scattered, navigation
-
-evaluate = jax.jit(lambda brdf, wi, wo: brdf(wi, wo))
-
-
-def norm(difference, expected):
-    return np.linalg.norm(difference) / np.linalg.norm(expected)
-
-
-def pairs(count):
-    direction = np.random.default_rng(0).standard_normal((2, count, 3))
-    direction[..., 2] = np.abs(direction[..., 2])
-    return direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+from tests.upper import evaluate, pairs, relative
 
 
 def test_lafortune_coefficients_make_their_model(data):
@@ -34,7 +21,7 @@ def test_lafortune_coefficients_make_their_model(data):
         expected = expected + np.maximum(base, 0) ** exponent
     found = np.asarray(evaluate(load_lafortune(path, "clay"), jnp.float32(wi), jnp.float32(wo)))
     # Exponents of 200 magnify the rounding of float32.
-    assert norm(found - expected, expected) < 1e-4
+    assert relative(found - expected, expected) < 1e-4
 
 
 BEYOND = 10**400
@@ -44,20 +31,13 @@ BEYOND = 10**400
     ("change", "message"),
     [
         (lambda entry: entry.pop("diffuse"), "must be JSON with materials"),
-        (lambda entry: entry.pop("lobes"), "must be JSON with materials"),
         (lambda entry: entry.update(diffuse=[0.1, -0.1, 0]), r"first diffuse at color \(1,\): -0.1"),
         (lambda entry: entry.update(diffuse=[0.1, 1e30, 0]), r"first diffuse at color \(1,\): 1e\+30"),
-        (lambda entry: entry.update(diffuse=[[0.1, 0.1, 0.1]]), "diffuse must be three numbers"),
         (lambda entry: entry.update(diffuse=["0.1", "0.1", "0.1"]), "diffuse must be three numbers"),
-        (lambda entry: entry.update(diffuse=[True, False, True]), "diffuse must be three numbers"),
         (lambda entry: entry.update(diffuse=[BEYOND, 0, 0]), "diffuse must be numbers that float64 can hold"),
-        (lambda entry: entry.update(lobes={"Cxy": 1}), "got clay in another form"),
         (lambda entry: entry.update(lobes=[3]), "got clay in another form"),
         (lambda entry: entry["lobes"][0].update(n=[1, 2, 0]), r"every n must be positive.*\(0, 2\): 0.0"),
-        (lambda entry: entry["lobes"][0].update(n=[1, 2, 1e-60]), r"every n must be positive.*\(0, 2\): 1e-60"),
         (lambda entry: entry["lobes"][1].update(Cz=[1, float("nan"), 0]), r"every Cz must be finite.*\(1, 1\): nan"),
-        (lambda entry: entry["lobes"][1].update(Cz=[1]), "must be JSON"),
-        (lambda entry: entry["lobes"][1].update(Cxy=[1e60, 1, 1]), r"every Cxy must be finite.*\(1, 0\): 1e\+60"),
         (lambda entry: entry["lobes"][0].update(Cxy=[-1, 1e30, 1]), r"got 1 that are not, .* \(0, 1\): Cxy 1e\+30"),
         (lambda entry: entry["lobes"][0].update(Cz=[1, 10, 10], n=[1, 1, 90]), r"\(0, 2\): Cxy -1, Cz 10, n 90"),
         (lambda entry: entry["lobes"][0].update(n=[1e30, 1, 1], Cz=[2, 1, 1]), r"\(0, 0\): Cxy -1, Cz 2, n 1e\+30"),
@@ -82,13 +62,9 @@ DEEP = "[" * 100_000
     ("content", "message"),
     [
         (b"{", "got other content"),
-        (b"", "got other content"),
         (b"\xff\xfe", "got other content"),
         (b"[]", "an object in braces, got a list"),
-        (b"3", "an object in braces, got a int"),
-        (b"null", "an object in braces, got a NoneType"),
         (b"{}", "got a file without materials"),
-        (b'{"materials": []}', "got a file without materials"),
         (b'{"materials": {}}', "got a file without materials"),
         (b'{"materials": {"clay": 3}}', "got clay in another form"),
         (b'{"materials": {"clay": {}, "clay": {}}}', "the name 'clay' 2 times"),
@@ -111,24 +87,16 @@ WARD = "NganWardDuer(albedo = [0.3, 0.2, 0.1], roughness = 0.1)"
     ("text", "message"),
     [
         (GOOD.format(WARD.replace("0.1)", "1e400)")), "roughness must be from 0 to 1e.09, got 1e400"),
-        (GOOD.format(WARD.replace("0.1)", "nan)")), "roughness must be from 0 to 1e.09, got nan"),
         (GOOD.format(WARD.replace("0.1)", "-0.1)")), "roughness must be from 0 to 1e.09, got -0.1"),
-        (GOOD.format(WARD.replace("0.1)", "ten)")), "roughness must be numbers, got 'ten'"),
         (GOOD.format(WARD.replace("roughness", "sharpness")), "it must have albedo, roughness once, got albedo"),
-        (GOOD.format(WARD.replace("0.1)", "0.1, roughness = 0.2)")), "got albedo, roughness, roughness"),
         (GOOD.format(WARD.replace("[0.3, 0.2, 0.1]", "[0.3, 0.2]")), r"albedo must be 3 numbers, got '\[0.3, 0.2\]'"),
-        (GOOD.format(WARD.replace("[0.3, 0.2, 0.1]", "[1e30, 1, 1]")), r"albedo must be from 0 to 1e\+09"),
-        (GOOD.format(WARD.replace("[0.3", "[" + "-" * 5000 + "3")), "albedo must be numbers"),
         (GOOD.format(WARD).replace("[0.1, 0.2, 0.3]", "[1e30, 1, 1]"), "the diffuse albedo must be from 0 to 1e"),
         (GOOD.format(WARD) * 2, "materials must have different names, got 1 names twice, first 'nickel'"),
         (
             GOOD.format("NganLafortune(albedo = [1, 1, 1], Cxy = -1, Cz = 1, sharpness = 0)"),
             "sharpness must be positive",
         ),
-        (
-            GOOD.format("NganLafortune(albedo = [1, 1, 1], Cxy = 0, Cz = 0, sharpness = 2)"),
-            "Cxy or Cz not 0",
-        ),
+        (GOOD.format("NganLafortune(albedo = [1, 1, 1], Cxy = 0, Cz = 0, sharpness = 2)"), "Cxy or Cz not 0"),
         (
             GOOD.format("NganLafortune(albedo = [9, 9, 9], Cxy = -1, Cz = 1, sharpness = 1e-4)"),
             "lobes must be at most 1e\\+12 high, got 3",
@@ -156,21 +124,3 @@ def test_scattered_values_that_no_surface_has_are_refused(tmp_path):
     path.write_text("2 400 700\n" + "0.1 0 0.2 0 0.5 0.5\n" * 3 + "0.1 0 0.2 0 0.5 1e30\n")
     with pytest.raises(ValueError, match=r"points\.brdf: .* at most 1e\+12 per sr, got 1 .*\(3, 1\): 1e\+30"):
         load_scattered(path)
-
-
-@pytest.mark.parametrize(
-    "load",
-    [
-        lambda path: load_lafortune(path, "clay"),
-        lambda path: load_ngan(path, "nickel"),
-        load_scattered,
-        lambda path: navigation.cook_torrance(path=path),
-    ],
-)
-def test_pipes_and_folders_in_place_of_fits_are_refused(tmp_path, load):
-    os.mkfifo(tmp_path / "pipe")
-    for path, kind in ((tmp_path / "pipe", "special file"), (tmp_path, "directory")):
-        with pytest.raises(ValueError, match=f"got a {kind}"):
-            load(path)
-    with pytest.raises(FileNotFoundError, match="there is no"):
-        load(tmp_path / "none")

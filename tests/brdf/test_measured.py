@@ -1,13 +1,11 @@
 import csv
-import os
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxprt.brdf import CookTorrance, load_merl, load_npf, measured
+from tests.upper import evaluate, relative
 
 MERL = (90, 90, 180)
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500
@@ -15,13 +13,6 @@ SCALE = np.array([1.0, 1.15, 1.66]) / 1500
 # cells of the MERL grid costs. Below, 1 / (cos_i cos_o) grows faster than cells follow it.
 INTERPOLATION = 0.003
 MODEL = CookTorrance(diffuse=[0.1, 0.2, 0.3], specular=[0.5, 0.3, 0.2], roughness=0.1, f0=0.2)
-evaluate = jax.jit(lambda brdf, wi, wo: brdf(wi, wo))
-
-
-@jax.jit
-def slopes(brdf, wi, wo):
-    value, pull = jax.vjp(lambda brdf, wi, wo: brdf(wi, wo), brdf, wi, wo)
-    return value, pull(jnp.ones_like(value))
 
 
 def pairs(count=4000, seed=0, lowest=0.0):
@@ -75,10 +66,6 @@ def planes(path):
     return np.fromfile(path, "<f8", offset=12).reshape(3, *MERL)
 
 
-def norm(difference, expected):
-    return np.linalg.norm(difference) / np.linalg.norm(expected)
-
-
 def test_table_is_met_at_the_centers_of_its_cells(x64):
     shape = (7, 6, 8)
     root = np.random.default_rng(1).uniform(0.1, 1, (*shape, 3))
@@ -100,16 +87,8 @@ def test_angles_repeat_after_half_a_turn_without_a_seam(x64):
 def test_merl_table_is_the_model_that_it_was_made_of(merl):
     wi, wo = pairs(lowest=np.sin(np.radians(12)))
     expected = evaluate(MODEL, wi, wo)
-    assert norm(evaluate(merl, wi, wo) - expected, expected) < INTERPOLATION
+    assert relative(evaluate(merl, wi, wo) - expected, expected) < INTERPOLATION
     assert merl.filled == 0
-
-
-def test_interpolated_cube_roots_are_more_precise_than_values(merl):
-    wi, wo = pairs(lowest=np.sin(np.radians(12)))
-    expected = evaluate(MODEL, wi, wo)
-    cube = eqx.tree_at(lambda each: each.root, merl, np.asarray(merl.root) ** 3)
-    linear = np.cbrt(evaluate(cube, wi, wo))
-    assert norm(evaluate(merl, wi, wo) - expected, expected) < 0.5 * norm(linear - expected, expected)
 
 
 def test_tables_are_reciprocal_nonnegative_and_dark_below_the_horizon(merl, data):
@@ -119,24 +98,11 @@ def test_tables_are_reciprocal_nonnegative_and_dark_below_the_horizon(merl, data
     for brdf in (merl, npf):
         found = np.asarray(evaluate(brdf, wi, wo))
         # Float32 angles next to the pole of a lobe that falls by decades.
-        assert norm(evaluate(brdf, wo, wi) - found, found) < 1e-4
+        assert relative(evaluate(brdf, wo, wi) - found, found) < 1e-4
         assert np.all(np.isfinite(found))
         assert np.all(found >= 0)
         assert np.all(np.asarray(evaluate(brdf, wi * below, wo)) == 0)
         assert np.all(np.asarray(evaluate(brdf, wi, wo * below)) == 0)
-
-
-HARD = {
-    "at the normal": ([0.0, 0, 1], [0.0, 0, 1]),
-    "half vector at the normal": ([0.6, 0, 0.8], [-0.6, 0, 0.8]),
-    "half vector nearly at the normal": ([0.6, 1e-7, 0.8], [-0.6, 1e-7, 0.8]),
-    "the same direction": ([0.6, 0, 0.8], [0.6, 0, 0.8]),
-    "nearly the same direction": ([0.6, 0, 0.8], [0.6, 1e-7, 0.8]),
-    "grazing apart": ([1.0, 0, 1e-7], [-1.0, 0, 1e-7]),
-    "grazing together": ([1.0, 0, 1e-7], [1.0, 0, 1e-7]),
-    "at the horizon": ([1.0, 0, 0], [0.0, 1, 0]),
-    "one grazing": ([0.0, 1, 1e-9], [0.0, 0, 1]),
-}
 
 
 def _small():
@@ -144,13 +110,6 @@ def _small():
     table = measured.tabulate(random.uniform(0.0, 2, (9, 8, 6, 3)), np.ones((9, 8, 6), bool))
     factors = (random.uniform(0.1, 1, shape) for shape in ((3,), (3,), (9, 3), (9, 3), (9, 3)))
     return {"half-difference": table, "microfacet": measured.MicrofacetTable(*(jnp.float32(f) for f in factors))}
-
-
-@pytest.mark.parametrize("kind", ["half-difference", "microfacet"])
-@pytest.mark.parametrize("case", HARD)
-def test_values_and_gradients_are_finite(kind, case):
-    for leaf in jax.tree.leaves(slopes(_small()[kind], *np.float32(HARD[case]))):
-        assert np.all(np.isfinite(np.asarray(leaf)))
 
 
 def test_table_is_the_same_from_all_sides_where_the_turn_is_undefined(x64):
@@ -179,7 +138,7 @@ def test_invalid_cells_of_merl_files_are_filled_and_counted(merl_file, merl, tmp
     assert brdf.filled == pytest.approx(np.sum(hole & above) / above.sum(), rel=1e-4)
     assert np.sum(hole & above) == hole.sum()
     root, whole = np.asarray(brdf.root), np.asarray(merl.root)
-    assert norm((root - whole)[hole], whole[hole]) < 0.1
+    assert relative((root - whole)[hole], whole[hole]) < 0.1
     np.testing.assert_array_equal(root[~hole & above], whole[~hole & above])
 
 
@@ -225,16 +184,6 @@ def test_merl_values_that_no_surface_has_are_refused_by_their_number_and_place(t
     assert np.all(np.isfinite(np.asarray(load_merl(write(tmp_path / "cold.binary", plane, (2, 2, 4))).root)))
 
 
-@pytest.mark.parametrize("load", [load_merl, lambda path: load_npf(path, "iron", names=path)])
-def test_pipes_and_folders_in_place_of_measurements_are_refused(tmp_path, load):
-    os.mkfifo(tmp_path / "pipe")
-    for path, kind in ((tmp_path / "pipe", "special file"), (tmp_path, "directory")):
-        with pytest.raises(ValueError, match=f"got a {kind}"):
-            load(path)
-    with pytest.raises(FileNotFoundError, match="there is no such file"):
-        load(tmp_path / "none")
-
-
 @pytest.fixture
 def npf(data):
     return data / "brdf/merl_npf_512x256_rgb32f.bin"
@@ -266,7 +215,7 @@ def test_microfacet_table_is_the_published_product_at_the_centers_of_bins(npf, m
     # The bins' floors are one rounding away at the centers, where the interpolant equals them.
     expected = published(row.astype(float), wi, wo)
     found = np.pi * np.asarray(evaluate(load_npf(npf, material), wi, wo))
-    assert norm(found - expected, expected) < 1e-6
+    assert relative(found - expected, expected) < 1e-6
 
 
 def test_first_bins_that_were_not_fitted_are_not_black(npf):
@@ -290,22 +239,10 @@ def albedo(brdf, angle, rows=200, columns=64):
     return weight.ravel() @ np.asarray(evaluate(brdf, jnp.broadcast_to(jnp.float32(wi), wo.shape), wo))
 
 
-def test_quadrature_of_the_albedo_is_right():
-    for angle in (0.0, 1.0, 1.4):
-        assert albedo(CookTorrance(diffuse=0.7, specular=0.0), angle) == pytest.approx(0.7, rel=0.01)
-
-
 def test_all_materials_reflect_less_than_they_receive(npf):
     for material in (npf.parent / "merl_npf_materials.txt").read_text().split():
         brdf = load_npf(npf, material)
         assert max(albedo(brdf, angle).max() for angle in (0.1, 1.0, 1.4)) < 0.8, material
-
-
-def test_materials_have_the_colors_of_their_names(npf):
-    red, green, blue = albedo(load_npf(npf, "gold-metallic-paint"), 0.5)
-    assert red > 1.3 * green > 2 * blue
-    red, green, blue = albedo(load_npf(npf, "blue-acrylic"), 0.5)
-    assert blue > 2 * green > 2 * red
 
 
 def test_fits_by_others_to_the_same_materials_agree(npf, data):
@@ -318,13 +255,6 @@ def test_fits_by_others_to_the_same_materials_agree(npf, data):
             ratio.append(np.pi * np.asarray(evaluate(load_npf(npf, line["material"]), wi, wo))[0] / diffuse)
     assert len(ratio) == 86
     np.testing.assert_allclose(np.median(ratio, 0), 1, atol=0.03)
-
-
-def test_value_per_cosine_is_bounded_at_grazing_angles(npf):
-    brdf = load_npf(npf, "white-marble")
-    low = jnp.array([[1.0, 0, 1e-6], [1.0, 0, 1e-3], [1.0, 0, 8e-3]])
-    found = evaluate(brdf, low, jnp.broadcast_to(jnp.array([-0.6, 0, 0.8]), low.shape))
-    np.testing.assert_allclose(found, jnp.broadcast_to(found[2], found.shape), rtol=0.1)
 
 
 def test_bad_tables_of_factors_are_refused(npf, tmp_path):
@@ -352,3 +282,10 @@ def test_bad_tables_of_factors_are_refused(npf, tmp_path):
     names.write_text("iron " * 300)
     with pytest.raises(ValueError, match=r"names.txt: must hold at most 256 names, got 300"):
         load_npf(path, "iron", names=names)
+
+
+def test_value_per_cosine_is_bounded_at_grazing_angles(npf):
+    brdf = load_npf(npf, "white-marble")
+    low = jnp.array([[1.0, 0, 1e-6], [1.0, 0, 1e-3], [1.0, 0, 8e-3]])
+    found = evaluate(brdf, low, jnp.broadcast_to(jnp.array([-0.6, 0, 0.8]), low.shape))
+    np.testing.assert_allclose(found, jnp.broadcast_to(found[2], found.shape), rtol=0.1)

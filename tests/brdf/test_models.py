@@ -12,21 +12,25 @@ from jaxprt.brdf import (
     AshikhminShirley,
     BlinnPhong,
     CookTorrance,
+    GGXInterface,
     Lafortune,
     Lambert,
     MetallicRoughness,
     Phong,
     PoulinFournier,
     PoulinFournierGrooves,
+    SchlickDiffuse,
     Ward,
     WardDuer,
+    measured,
 )
+from tests.upper import albedo, evaluate, highlights, pairs, unit
 
 # Models of one class have colors in the same places, so that they share what is compiled.
 WHITE = np.ones(3)
 GOLD = np.array([1.0, 0.7, 0.2])
 ISOTROPIC = {
-    "lambert": Lambert(0.7),
+    "lambert": Lambert(0.7 * WHITE),
     "phong": Phong(diffuse=0.3, specular=0.7 * GOLD, exponent=20),
     "sharp phong": Phong(diffuse=0.0, specular=WHITE, exponent=10000),
     "blinn-phong": BlinnPhong(diffuse=0.3, specular=0.7 * GOLD, exponent=20),
@@ -51,7 +55,17 @@ ANISOTROPIC = {
     "bumps": PoulinFournier(diffuse=0.3, specular=0.7 * WHITE, exponent=10000, distance=1.5, height=-0.3),
     "grooves": PoulinFournierGrooves(diffuse=0.3, specular=0.7 * WHITE, exponent=50, distance=2.2, height=0.1),
 }
-MODELS = ISOTROPIC | ANISOTROPIC
+MICROFACET = {
+    "sharp ggx": GGX(WHITE, [0.1, 0.1], 0.0),
+    "rough ggx": GGX(WHITE, [1.0, 1.0], 0.0),
+    "stretched ggx": GGX(GOLD, [0.3, 0.8], 1.0),
+    "mirror": GGXInterface(0 * WHITE, WHITE, [0.1, 0.1]),
+    "stretched interface": GGXInterface(GOLD, 3 * WHITE, [0.2, 0.6]),
+    "base": SchlickDiffuse(GOLD),
+    "gold": MetallicRoughness(GOLD, 1.0, 0.5, anisotropy=0.6),
+    "plastic": MetallicRoughness(GOLD, 0.0, 0.3),
+}
+MODELS = ISOTROPIC | ANISOTROPIC | MICROFACET
 each_model = pytest.mark.parametrize("name", MODELS)
 
 MIRROR = np.array([-1.0, -1, 1])
@@ -59,52 +73,22 @@ DATA_TOLERANCE = 0.15  # Median over 86 materials of fits that each have some te
 
 
 @jax.jit
-def evaluate(model, wi, wo):
-    return model(wi, wo)
-
-
-@jax.jit
 def slopes(model, wi, wo):
-    value, pull = jax.vjp(lambda *given: given[0](*given[1:]), model, wi, wo)
-    return value, pull(jnp.ones_like(value))
+    """Values for pairs of directions, and for each pair the derivatives of their sum by everything."""
+
+    def one(wi, wo):
+        value, pull = jax.vjp(lambda *given: given[0](*given[1:]), model, wi, wo)
+        return value, pull(jnp.ones_like(value))
+
+    return jax.vmap(one)(wi, wo)
 
 
-def _unit(vector):
-    return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
-
-
-def _pairs(count=4000, seed=0):
-    direction = np.random.default_rng(seed).standard_normal((2, count, 3))
-    direction[..., 2] = np.abs(direction[..., 2])
-    return jnp.asarray(_unit(direction), jnp.result_type(float))
-
-
-def _highlights(width, count=4000):
-    """Pairs whose half vectors are about as far from the normal as the lobe is wide; 70 degrees at most."""
-    random = np.random.default_rng(3)
-    wi = random.standard_normal((count, 3))
-    wi[:, 2] = 0.4 * np.linalg.norm(wi[:, :2], axis=-1) + np.abs(wi[:, 2])
-    wi = _unit(wi)
-    wo = _unit(wi * MIRROR + width * random.standard_normal((count, 3)) * [1, 1, 0])
-    return wi, wo
-
-
-def _albedo(model, tilt, azimuth=0.65, count=300, around=120):
-    """Directional albedo, by the midpoint rule over half vectors, finest around the normal; float64."""
-    wo = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
-    step = (np.arange(count) + 0.5) / count
-    theta, phi = np.meshgrid(np.pi / 2 * step**3, 2 * np.pi * (np.arange(around) + 0.5) / around, indexing="ij")
-    weight = (np.pi / 2 * 3 * step**2 / count)[:, None] * np.sin(theta) * 2 * np.pi / around
-    half = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
-    cosine = half @ wo
-    wi = 2 * cosine[..., None] * half - wo
-    weight = weight * 4 * np.maximum(cosine, 0) * np.maximum(wi[..., 2], 0)  # d wi = 4 (h.wo) dh
-    value = evaluate(model, jnp.asarray(wi.reshape(-1, 3)), jnp.broadcast_to(jnp.asarray(wo), (wi.size // 3, 3)))
-    return weight.ravel() @ np.asarray(value)
+def _pairs(count=4000):
+    return pairs(count).astype(jnp.result_type(float))
 
 
 def _half(wi, wo):
-    half = _unit(wi + wo)
+    half = unit(wi + wo)
     return half, half[:, 2], np.sum(half * wi, -1)
 
 
@@ -166,60 +150,46 @@ each_formula = pytest.mark.parametrize(("model", "formula", "parameters", "width
 
 
 @each_model
-def test_reciprocity(name):
+def test_models_are_reciprocal_not_negative_and_dark_below_the_horizon(name):
     wi, wo = _pairs()
-    np.testing.assert_allclose(evaluate(MODELS[name], wi, wo), evaluate(MODELS[name], wo, wi), rtol=3e-5)
-
-
-@each_model
-def test_values_are_not_negative_and_vanish_below_the_horizon(name):
-    wi, wo = _pairs()
-    below = jnp.array([1.0, 1, -1])
-    assert jnp.all(evaluate(MODELS[name], wi, wo) >= 0)
-    assert jnp.all(evaluate(MODELS[name], wi * below, wo) == 0)
-    assert jnp.all(evaluate(MODELS[name], wi, wo * below) == 0)
+    below = np.float32([1, 1, -1])
+    value = np.asarray(evaluate(MODELS[name], wi, wo))
+    assert np.all(value >= 0)
+    np.testing.assert_allclose(evaluate(MODELS[name], wo, wi), value, rtol=3e-5)
+    for pair in ((wi * below, wo), (wi, wo * below)):
+        assert not np.any(evaluate(MODELS[name], *pair))
 
 
 @each_formula
-def test_model_equals_the_published_formula(model, formula, parameters, width, x64, close):
-    wi, wo = _highlights(width)
-    found = evaluate(model(*parameters), jnp.asarray(wi), jnp.asarray(wo))
-    # A large exponent of a cosine next to 1 is itself uncertain in the formula.
-    close(found[:, 0], formula(wi, wo, *parameters), tolerance=1e-10)
-
-
-@each_formula
-def test_float32_keeps_the_highlight(model, formula, parameters, width, close):
-    wi, wo = _highlights(width)
-    found = evaluate(model(*parameters), jnp.asarray(wi, jnp.float32), jnp.asarray(wo, jnp.float32))
+def test_model_equals_the_published_formula(model, formula, parameters, width, close):
+    wi, wo = highlights(width)
+    expected = formula(wi, wo, *parameters)
     # float32 directions are off by 6e-8, which is 6e-6 of the sharpest lobe, and the exponent is around 10.
-    close(found[:, 0], formula(wi, wo, *parameters), tolerance=1e-4)
+    close(evaluate(model(*parameters), np.float32(wi), np.float32(wo))[:, 0], expected, tolerance=1e-4)
+    with jax.enable_x64(True):
+        # A large exponent of a cosine next to 1 is itself uncertain in the formula.
+        close(evaluate(model(*parameters), wi, wo)[:, 0], expected, tolerance=1e-10)
 
 
-CONSERVING = [name for name in MODELS if not re.search(r"duer|lafortune", name)]
+CONSERVING = [name for name in MODELS if not re.search(r"duer|lafortune|plastic|base", name)]
 
 
 @pytest.mark.parametrize("name", CONSERVING)
 def test_energy_is_conserved(name, x64):
     model = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), MODELS[name])
     for tilt in (0.0, 0.6, 1.2, 1.5, 1.56):
-        assert np.all(_albedo(model, tilt) < 1.0001), tilt
-
-
-def test_lambert_reflects_its_albedo():
-    wi, wo = _pairs()
-    np.testing.assert_allclose(evaluate(MODELS["lambert"], wi, wo) * np.pi, 0.7, rtol=1e-6)
+        assert np.all(albedo(model, tilt) < 1.0001), tilt
 
 
 @pytest.mark.parametrize("model", [Phong, BlinnPhong])
-@pytest.mark.parametrize("exponent", [0.0, 1.0, 7.5, 300.0, 10000.0])
+@pytest.mark.parametrize("exponent", [0.0, 7.5, 10000.0])
 def test_phong_lobes_reflect_their_albedo_at_normal_incidence(model, exponent, x64):
-    assert _albedo(model(0.0, 0.6, exponent), 0.0) == pytest.approx(0.6, rel=1e-4)
+    assert albedo(model(0.0, 0.6, exponent), 0.0) == pytest.approx(0.6, rel=1e-4)
 
 
 def test_phong_lobe_reflects_half_its_albedo_at_grazing_incidence(x64):
     # With exponent 0 what is left of a hemisphere at the horizon is a quarter of a sphere: half of Lambert's.
-    assert _albedo(Phong(0.0, 1.0, 0.0), np.pi / 2 - 1e-3) == pytest.approx(0.5, rel=2e-3)
+    assert albedo(Phong(0.0, 1.0, 0.0), np.pi / 2 - 1e-3) == pytest.approx(0.5, rel=2e-3)
 
 
 def test_blinn_phong_without_exponent_is_lambert(close):
@@ -244,7 +214,7 @@ def mitsuba():
 
 def test_mitsuba_has_the_same_distribution_of_normals(mitsuba):
     theirs = mitsuba.MicrofacetDistribution(mitsuba.MicrofacetType.Beckmann, 0.4, 0.15, False)
-    normal = np.float32(_unit(np.asarray(_pairs(200)[0]) * [0.5, 0.5, 1]))
+    normal = np.float32(unit(np.asarray(_pairs(200)[0]) * [0.5, 0.5, 1]))
     expected = [theirs.eval(mitsuba.Vector3f(each.tolist())) for each in normal]
     found = evaluate(Ward(0.0, 1.0, 0.4, 0.15), jnp.asarray(normal), jnp.asarray(normal))[:, 0] * 4
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
@@ -254,7 +224,7 @@ def test_mitsuba_has_the_same_highlights_where_nothing_is_hidden(mitsuba):
     # Mitsuba has 4 where Ngan has pi, no Fresnel term here, and Smith's G: 1 where V-shaped grooves hide nothing.
     description = {"type": "roughconductor", "distribution": "beckmann", "alpha": 0.1, "material": "none"}
     theirs, context = mitsuba.load_dict(description), mitsuba.BSDFContext()
-    wi, wo = (np.float32(w) for w in _highlights(0.1, 200))
+    wi, wo = (np.float32(w) for w in highlights(0.1, 200))
     expected = []
     for light, view in zip(wi, wo, strict=True):
         seen = mitsuba.SurfaceInteraction3f()
@@ -278,7 +248,7 @@ def test_models_agree_on_measured_materials(data):
     # highlights at 45 degrees agree, and the exponent of Blinn and Phong is 2 / m^2, as for lobes of the half vector.
     # Other normalizations are off by factors of two to four, an exponent of the mirror direction by four.
     table = {name: _fits(data / "brdf" / f"ngan2005_{name}.fit") for name in ("cooktorrance", "wardduer", "blinnphong")}
-    wi = jnp.array([np.sqrt(0.5), 0, np.sqrt(0.5)])
+    wi = np.float32([np.sqrt(0.5), 0, np.sqrt(0.5)])
     ratio, exponent = [], []
     for name, (_, (weight, f0, roughness)) in table["cooktorrance"].items():
         if roughness > 0.3:
@@ -291,7 +261,7 @@ def test_models_agree_on_measured_materials(data):
             Ward(0.0, reflectance, m, m),
             BlinnPhong(0.0, 4 * np.array(factor) * (2 ** (-n / 2) + n) / (n + 4), n),
         )
-        peak = [evaluate(model, wi, wi * jnp.asarray(MIRROR, wi.dtype))[0] for model in models]
+        peak = [np.asarray(evaluate(model, wi, wi * np.float32(MIRROR)))[0] for model in models]
         ratio.append(np.array(peak[1:]) / peak[0])
         exponent.append(n * roughness**2 / 2)
     assert len(ratio) > 60
@@ -311,78 +281,71 @@ def test_measured_lafortune_lobes_equal_their_formula_and_reflect_less_than_all(
             base = cxy[lobe] * (product[:, 0] + product[:, 1]) + cz[lobe] * product[:, 2]
             expected += np.maximum(base, 0) ** n[lobe]
         close(evaluate(model, wi, wo), expected, tolerance=1e-10)  # exponents of 200
-        assert np.all(_albedo(model, 0.0) < 1)
+        assert np.all(albedo(model, 0.0) < 1)
 
 
-HARD = {
-    "at the normal": ([0.0, 0, 1], [0.0, 0, 1]),
-    "half vector at the normal": ([0.6, 0, 0.8], [-0.6, 0, 0.8]),
-    "grazing apart": ([1.0, 0, 1e-7], [-1.0, 0, 1e-7]),
-    "grazing apart across": ([0.0, 1, 1e-7], [0.0, -1, 1e-7]),
-    "grazing apart, a little": ([1.0, 0, 2e-3], [-1.0, 0, 1e-3]),
-    "grazing together": ([1.0, 0, 1e-7], [1.0, 0, 1e-7]),
-    "grazing together across": ([0.0, 1, 1e-7], [0.0, 1, 1e-7]),
-    "at the horizon": ([1.0, 0, 0], [0.0, 1, 0]),
-    "one grazing": ([0.0, 1, 1e-9], [0.0, 0, 1]),
-    "one grazing along": ([1.0, 0, 1e-9], [0.0, 0, 1]),
-    "a quarter turn apart": ([0.8, 0, 0.6], [0.6, 0, 0.8]),
-    "opposite": ([0.0, 0, 1], [0.0, 0, -1]),
+HARD = np.array(
+    [
+        ([0.0, 0, 1], [0.0, 0, 1]),
+        ([0.6, 0, 0.8], [-0.6, 0, 0.8]),
+        ([0.6, 1e-7, 0.8], [-0.6, 1e-7, 0.8]),  # the half vector nearly at the normal
+        ([0.6, 0, 0.8], [0.6, 0, 0.8]),
+        ([0.6, 0, 0.8], [0.6, 1e-7, 0.8]),
+        ([1.0, 0, 1e-7], [-1.0, 0, 1e-7]),  # grazing, apart and together, along and across
+        ([0.0, 1, 1e-7], [0.0, -1, 1e-7]),
+        ([1.0, 0, 2e-3], [-1.0, 0, 1e-3]),
+        ([1.0, 0, 1e-7], [1.0, 0, 1e-7]),
+        ([0.0, 1, 1e-7], [0.0, 1, 1e-7]),
+        ([1.0, 0, 0], [0.0, 1, 0]),  # at the horizon
+        ([0.0, 1, 1e-9], [0.0, 0, 1]),
+        ([1.0, 0, 1e-9], [0.0, 0, 1]),
+        ([0.8, 0, 0.6], [0.6, 0, 0.8]),  # a quarter turn apart
+        ([0.0, 0, 1], [0.0, 0, -1]),
+    ],
+    np.float32,
+).swapaxes(0, 1)
+RANDOM = np.random.default_rng(4)
+# Ends of the parameters, and tables.
+ENDS = {
+    "phong": Phong(specular=WHITE, exponent=0),
+    "blinn-phong": BlinnPhong(specular=WHITE, exponent=0),
+    "ward": Ward(specular=WHITE, along=0, across=0),
+    "ward-duer": WardDuer(specular=WHITE, along=0, across=0),
+    "cook-torrance": CookTorrance(roughness=0, f0=0 * WHITE),
+    "lafortune": Lafortune(0, [0], [0], [0], [1]),
+    **{f"cylinders {shape}": PoulinFournier(0.3, WHITE, 0, *shape) for shape in [(2, 0), (2, 1), (1, -1), (4, 1)]},
+    **{f"grooves {shape}": PoulinFournierGrooves(0.3, WHITE, 0, *shape) for shape in [(2, 0), (2, 1), (1, 0)]},
+    "smooth": MetallicRoughness(GOLD, 0.5, 0.0),
+    "smooth and stretched": MetallicRoughness(GOLD, 0.5, 0.0, 0.0, 0.0, GOLD, 1.0, 0.5),
+    "no interface": MetallicRoughness(0 * GOLD, 0.0, 1.0, 1.0, 1.0, 0 * GOLD),
+    "smooth mirror": GGX(GOLD, [0.0, 0.0], 0.0),
+    "smooth along": GGX(GOLD, [0.0, 1.0], 0.0),
+    "smooth glass": GGXInterface(1.5 * WHITE, 0 * WHITE, [0.0, 0.0]),
+    "perfect mirror": GGXInterface(0 * WHITE, WHITE, [0.0, 0.0]),
+    "nothing": GGXInterface(WHITE, 0 * WHITE, [0.0, 0.0]),
+    "no index": GGXInterface(0 * WHITE, 0 * WHITE, [0.5, 0.5]),
+    "half-difference": measured.tabulate(RANDOM.uniform(0.0, 2, (9, 8, 6, 3)), np.ones((9, 8, 6), bool)),
+    "microfacet": measured.MicrofacetTable(
+        *(jnp.float32(RANDOM.uniform(0.1, 1, shape)) for shape in ((3,), (3,), (9, 3), (9, 3), (9, 3)))
+    ),
 }
 
 
-@each_model
-def test_values_and_gradients_are_finite(name):
-    _check_finite(MODELS[name])
-
-
-@pytest.mark.parametrize(
-    "model",
-    [
-        Phong(specular=WHITE, exponent=0),
-        BlinnPhong(specular=WHITE, exponent=0),
-        Ward(specular=WHITE, along=0, across=0),
-        WardDuer(specular=WHITE, along=0, across=0),
-        CookTorrance(roughness=0, f0=0 * WHITE),
-        Lafortune(0, [0], [0], [0], [1]),
-        *(PoulinFournier(0.3, WHITE, 0, *shape) for shape in [(2, 0), (2, 1), (1, -1), (4, 1)]),
-        *(PoulinFournierGrooves(0.3, WHITE, 0, *shape) for shape in [(2, 0), (2, 1), (1, 0)]),
-    ],
-    ids=repr,
-)
-def test_values_and_gradients_are_finite_at_the_ends_of_the_parameters(model):
-    _check_finite(model)
-
-
-def _check_finite(model):
-    for case, (wi, wo) in HARD.items():
-        for leaf in jax.tree.leaves(slopes(model, np.array(wi, np.float32), np.array(wo, np.float32))):
-            assert np.all(np.isfinite(np.asarray(leaf))), case
+@pytest.mark.parametrize("model", [*MODELS.values(), *ENDS.values()], ids=[*MODELS, *(f"end {name}" for name in ENDS)])
+def test_values_and_gradients_are_finite_at_hard_directions_and_at_the_ends_of_the_parameters(model):
+    for leaf in jax.tree.leaves(slopes(model, *HARD)):
+        np.testing.assert_array_equal(np.argwhere(~np.isfinite(leaf))[:, 0], [])
 
 
 @pytest.mark.parametrize("name", ANISOTROPIC)
 def test_anisotropic_models_are_symmetric_about_both_axes_but_know_them(name, x64, close):
     wi, wo = _pairs()
     model = ANISOTROPIC[name]
-    value = evaluate(model, wi, wo)
+    value = np.asarray(evaluate(model, wi, wo))
     for flip in ([-1.0, 1, 1], [1.0, -1, 1]):
-        close(evaluate(model, wi * jnp.array(flip), wo * jnp.array(flip)), value, tolerance=1e-10)
+        close(evaluate(model, wi * flip, wo * flip), value, tolerance=1e-10)
     turned = evaluate(model, wi[:, [1, 0, 2]], wo[:, [1, 0, 2]])
-    assert jnp.linalg.norm(turned - value) > 0.1 * jnp.linalg.norm(value)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: CookTorrance(roughness=-0.2), "roughness of CookTorrance must be at least 0, got 1 of 1 values"),
-        (lambda: Lambert([0.5, np.nan, 0.2]), r"albedo of Lambert must be finite, got 1 of 3 .* first at \(1,\): nan"),
-        (lambda: AshikhminShirley(nu=np.inf), "nu of AshikhminShirley must be finite"),
-        (lambda: Lafortune(0.1, [-0.9], [np.nan], [0.9], [10]), "cy of Lafortune must be finite"),
-        (lambda: PoulinFournier(distance=0), "distance of PoulinFournier must be at least 0.0001, got 1 of 1 values"),
-    ],
-)
-def test_parameters_that_no_surface_has_are_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+    assert np.linalg.norm(turned - value) > 0.1 * np.linalg.norm(value)
 
 
 def test_parameters_are_not_looked_at_where_they_are_traced():

@@ -1,11 +1,11 @@
 import functools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxprt.brdf import CookTorrance, load_scattered, measured, scattered
+from tests.upper import evaluate, relative
 
 WAVELENGTH = np.arange(400.0, 701, 10)
 MATERIALS = ["acryl_blue", "cayman", "mystique"]
@@ -17,7 +17,6 @@ SWING = 3.0
 # Of the cube root at the samples: .128, .102, .123 measured. Part is smoothing, part the table: the brightest sample,
 # 80 degrees from the normal, comes out a third too dark with 48 cells in theta_d and 5 % with 192.
 SMOOTHED = 0.14
-evaluate = jax.jit(lambda brdf, wi, wo: brdf(wi, wo))
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +29,6 @@ def made(data):
         return *scattered.read_scattered(path), load_scattered(path)
 
     return of
-
-
-def norm(difference, expected):
-    return np.linalg.norm(difference) / np.linalg.norm(expected)
 
 
 def upper(count, seed=0, lowest=0.2):
@@ -69,7 +64,7 @@ def test_samples_left_out_are_predicted(data, material):
     median, rest = LEFT_OUT[material]
     assert np.median(error / (size + 1e-9)) < median
     matte = size < np.quantile(size, 0.98)
-    assert norm((found - expected)[matte], expected[matte]) < rest
+    assert relative((found - expected)[matte], expected[matte]) < rest
 
 
 @pytest.mark.parametrize("material", MATERIALS)
@@ -93,24 +88,17 @@ def test_values_between_samples_are_like_those_of_the_samples_around(made, mater
 @pytest.mark.parametrize("material", MATERIALS)
 def test_measured_materials_are_brdfs(made, material):
     wi, wo, color, brdf = made(material)
-    assert norm(np.cbrt(values(brdf, wi, wo)) - np.cbrt(color), np.cbrt(color)) < SMOOTHED
+    assert relative(np.cbrt(values(brdf, wi, wo)) - np.cbrt(color), np.cbrt(color)) < SMOOTHED
     wi, wo = upper(4000, 1, lowest=0), upper(4000, 2, lowest=0)
     found = values(brdf, wi, wo)
     assert np.all(found >= 0)
     assert np.all(found <= 1.001 * color.max(0))
-    assert norm(values(brdf, wo, wi) - found, found) < 1e-5
+    assert relative(values(brdf, wo, wi) - found, found) < 1e-5
     mirrored = np.array([1, -1, 1])
-    assert norm(values(brdf, wi * mirrored, wo * mirrored) - found, found) < 1e-4
+    assert relative(values(brdf, wi * mirrored, wo * mirrored) - found, found) < 1e-4
     turn = np.array([[0.6, 0.8, 0], [-0.8, 0.6, 0], [0, 0, 1]])
-    assert norm(values(brdf, wi @ turn, wo @ turn) - found, found) < 1e-4
+    assert relative(values(brdf, wi @ turn, wo @ turn) - found, found) < 1e-4
     assert np.mean(found, 0).max() * np.pi < 1
-
-
-def test_colors_of_the_materials_are_those_of_their_names(data):
-    blue = scattered.read_scattered(data / "brdf/acryl_blue.brdf")[2]
-    assert np.median(blue[:, 2]) > 10 * np.median(blue[:, :2])
-    cyan = scattered.read_scattered(data / "brdf/cayman.brdf")[2]
-    assert np.median(cyan[:, 1:], 0).min() > 10 * np.median(cyan[:, 0])
 
 
 def test_a_smooth_brdf_is_recovered_from_scattered_samples():
@@ -122,7 +110,9 @@ def test_a_smooth_brdf_is_recovered_from_scattered_samples():
     expected = values(model, wi, wo)
     found = values(brdf, wi, wo)
     assert np.median(np.abs(found - expected) / expected) < 1e-3
-    assert norm(found - expected, expected) < 0.04  # In the highlight's thinly sampled parts; .09 with half as many.
+    assert (
+        relative(found - expected, expected) < 0.04
+    )  # In the highlight's thinly sampled parts; .09 with half as many.
 
 
 def test_interpolation_commutes_with_scaling_permuting_exchanging_and_turning():
@@ -139,14 +129,7 @@ def test_interpolation_commutes_with_scaling_permuting_exchanging_and_turning():
         scattered.interpolate_scattered(wi * [1, -1, 1], wo * [1, -1, 1], value, **small).root,
         scattered.interpolate_scattered(np.r_[wi, wo], np.r_[wo, wi], np.r_[value, value], **small).root,
     ):
-        assert norm(found - expected, expected) < 1e-4
-
-
-def test_constant_and_black_samples_stay_so():
-    wi, wo = upper(50, 10), upper(50, 11)
-    for value in (0.25, 0.0):
-        brdf = scattered.interpolate_scattered(wi, wo, np.full((50, 3), value), resolution=(6, 6, 4))
-        np.testing.assert_allclose(values(brdf, wi, wo), value, atol=1e-6)
+        assert relative(found - expected, expected) < 1e-4
 
 
 def test_cells_beyond_the_measured_directions_are_counted():
@@ -162,7 +145,7 @@ def test_equal_reflectance_is_white():
     np.testing.assert_allclose(color, [[1, 1, 1], [0.2, 0.2, 0.2]], rtol=1e-12)
 
 
-@pytest.mark.parametrize("step", [5.0, 10.0, 20.0])
+@pytest.mark.parametrize("step", [5.0, 20.0])
 def test_colors_agree_with_tabulated_matching_functions(step):
     """Mitsuba's tables of the observer, of D65, and its primaries, over the whole spectrum."""
     mitsuba = pytest.importorskip("mitsuba")
@@ -177,12 +160,6 @@ def test_colors_agree_with_tabulated_matching_functions(step):
         expected = np.array(mitsuba.xyz_to_srgb(mitsuba.Color3f(*xyz.tolist())))
         found = scattered.spectrum_to_rgb(np.interp(wavelength, fine, spectrum), wavelength)
         np.testing.assert_allclose(found, expected, atol=0.015)
-
-
-@pytest.mark.parametrize("wavelength", [[400, 450], [500, 520, 700], [400.0, 500, 700]])
-def test_colors_need_the_visible_spectrum(wavelength):
-    with pytest.raises(ValueError, match="reach from 430 to 650 nm"):
-        scattered.spectrum_to_rgb(np.ones(len(wavelength)), np.array(wavelength, float))
 
 
 def test_written_samples_are_read(tmp_path):
@@ -206,7 +183,6 @@ def _changed(place, value):
     ("change", "message"),
     [
         (lambda row: row.ravel()[:-3], r"each sample must have 4 angles and 31 values, got 29 samples and 32 further"),
-        (lambda row: row[:0], "got 0 samples and 0 further numbers"),
         (lambda row: row[:5], "at least 10 different samples, got 5"),
         (lambda row: np.repeat(row[:1], 20, 0), "at least 10 different samples, got 1"),
         (_changed((3, 7), np.nan), r"finite, got 1 that are not, the first number at sample, column \(3, 7\): nan"),
@@ -223,10 +199,8 @@ def test_bad_samples_are_refused(tmp_path, change, message):
     ("text", "message"),
     [
         ("", "must begin with the number of wavelengths, at least 2, got an empty file"),
-        ("# only a comment", "got an empty file"),
         ("1.5 2", "at least 2, got 1.5"),
         ("3\n400 500 450 0 0", r"3 increasing wavelengths in nm, got \[400.0, 500.0, 450.0\]"),
-        ("3\n400 500", r"3 increasing wavelengths in nm, got \[400.0, 500.0\]"),
         ("2\n400 700\n0 0 x 0 1 1", "line 3 must hold numbers, got 'x'"),
         ("2\n400 700\n0 0 0 0 1 1", "reach from 430 to 650 nm"),
     ],

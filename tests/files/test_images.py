@@ -1,7 +1,5 @@
 """Image files: what is read, of which formats, and what is refused."""
 
-import os
-import pathlib
 import re
 import struct
 import zlib
@@ -70,18 +68,6 @@ def test_alpha_neither_changes_the_colors_nor_is_decoded(tmp_path):
     np.testing.assert_allclose(read[..., 3], image[..., 3], atol=0.51 / 255)
 
 
-@pytest.mark.parametrize("name", ["image.exr", "image.hdr", "image.png", "image.jpg"])
-def test_truncated_files_are_refused_by_name(tmp_path, name):
-    path = tmp_path / name
-    image = random_image(64, 64, 3)
-    write_exr(path, image) if name.endswith("exr") else write_oiio(path, image, "uint8")
-    whole = path.read_bytes()
-    for length in (0, 3, 100, len(whole) // 2, len(whole) - 40):
-        path.write_bytes(whole[:length])
-        with pytest.raises(ValueError, match=name):
-            read_image(path)
-
-
 def test_content_counts_and_not_the_name(tmp_path):
     image = random_image(8, 16, 3)
     write_exr(tmp_path / "image.exr", image)
@@ -105,27 +91,6 @@ def test_what_is_no_image_is_refused_by_name(tmp_path):
     (tmp_path / "empty.exr").write_bytes(b"")
     with pytest.raises(ValueError, match=r"empty\.exr .* got an empty file"):
         read_image(tmp_path / "empty.exr")
-
-
-def test_headers_that_ask_for_something_else_are_refused(tmp_path):
-    write_oiio(tmp_path / "image.hdr", random_image(8, 16, 3), "float")
-    whole = (tmp_path / "image.hdr").read_bytes()
-    path = tmp_path / "changed.hdr"
-    for old, new, message in (
-        (b"-Y 8 +X 16", b"-Y 8 +Y 16", "resolution"),
-        (b"rle_rgbe", b"rle_xyze", "XYZ"),
-        (b"-Y 8 +X 16", b"-Y 60000 +X 60000", "must"),
-    ):
-        assert old in whole
-        path.write_bytes(whole.replace(old, new))
-        with pytest.raises(ValueError, match=message):
-            read_image(path)
-
-
-def test_a_path_may_be_relative(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write_exr("image.exr", random_image(2, 2, 3))
-    assert read_image(pathlib.Path("image.exr"))[0].shape == (2, 2, 3)
 
 
 @pytest.mark.parametrize(("form", "error"), [("png", 1 / 255), ("jpeg", 0.02), ("tiff", 1 / 255)])
@@ -226,32 +191,6 @@ def test_reading_in_blocks_of_rows_gives_what_reading_at_once_gives(tmp_path, mo
     for values in (1, 31 * 3 * 7):
         monkeypatch.setattr(pixels, "_VALUES", values)
         np.testing.assert_array_equal(read_image(path)[0], whole)
-
-
-def test_ctrl_c_interrupts_reading_between_blocks(tmp_path, monkeypatch):
-    path = tmp_path / "image.png"
-    write_png(path, random_image(50, 31, 3))
-    lines, blocks = [], pixels.blocks
-
-    def interrupted(*reader, **options):
-        for rows, values in blocks(*reader, **options):
-            lines.append(rows)
-            if len(lines) == 3:
-                raise KeyboardInterrupt
-            yield rows, values
-
-    monkeypatch.setattr(pixels, "_VALUES", 31 * 3 * 7)
-    monkeypatch.setattr(pixels, "blocks", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        read_image(path)
-    assert lines == [range(0, 7), range(7, 14), range(14, 21)]
-
-
-def test_what_is_no_regular_file_is_refused(tmp_path):
-    os.mkfifo(tmp_path / "pipe.png")
-    for path in (tmp_path / "pipe.png", pathlib.Path("/dev/zero")):
-        with pytest.raises(ValueError, match=f"{path.name} must be an image file, got a special file"):
-            read_image(path)
 
 
 def write_tiff_of_tiles(path, side):
@@ -364,11 +303,6 @@ def test_tiles_of_any_shape_are_read(tmp_path, tile):
     np.testing.assert_array_equal(read_image(tmp_path / "image.exr")[0], image)
 
 
-def test_whole_numbers_are_read_as_they_are(tmp_path):
-    write_exr_channels(tmp_path / "image.exr", {"Y": np.arange(12, dtype=np.uint32).reshape(3, 4)})
-    np.testing.assert_array_equal(read_image(tmp_path / "image.exr")[0][..., 0], np.arange(12).reshape(3, 4))
-
-
 def test_the_first_part_with_rgb_is_read_and_depth_is_no_color(tmp_path):
     path, image = tmp_path / "image.exr", random_image(4, 6, 3)
     depth = {"Z": image[..., 0] + 5}
@@ -388,21 +322,6 @@ def test_parts_that_are_ignored_though_they_have_colors_are_named(tmp_path):
     with pytest.warns(UserWarning, match=r"image\.exr has colors in several parts: 'left' is used, 'right' ignored"):
         read = read_image(path)[0]
     np.testing.assert_array_equal(read, image)
-
-
-def test_each_part_has_a_data_window_of_its_own(tmp_path):
-    path, image = tmp_path / "image.exr", random_image(3, 4, 3)
-    display = (np.array([0, 0], np.int32), np.array([7, 5], np.int32))
-    window = (np.array([2, 1], np.int32), np.array([5, 3], np.int32))
-    whole = {"displayWindow": display, "dataWindow": display}
-    write_parts(
-        path,
-        depth=({"Z": random_image(6, 8)}, whole),
-        beauty=(planes(image), {"displayWindow": display, "dataWindow": window}),
-    )
-    expected = np.zeros((6, 8, 3), np.float32)
-    expected[1:4, 2:6] = image
-    np.testing.assert_array_equal(read_image(path)[0], expected)
 
 
 def test_layers_are_named_where_there_is_no_other_color(tmp_path):
@@ -437,17 +356,6 @@ def test_color_interop_ids_are_used_where_there_are_no_chromaticities(tmp_path):
     for name, expected in (("lin_ap0_scene", image @ AP0_TO_REC709.T), ("lin_rec709_scene", image), ("data", image)):
         write_exr_channels(tmp_path / "image.exr", planes(image), colorInteropID=name)
         np.testing.assert_allclose(read_image(tmp_path / "image.exr")[0], expected, atol=4 * MATRIX_ERROR)
-
-
-def test_chromaticities_of_the_first_part_hold_for_the_others(tmp_path):
-    image = random_image(5, 6, 3)
-    write_parts(
-        tmp_path / "image.exr",
-        depth=({"Z": image[..., 0]}, {"chromaticities": AP0}),
-        beauty=(planes(image), {"chromaticities": AP0}),
-    )
-    read = read_image(tmp_path / "image.exr")[0]
-    np.testing.assert_allclose(read, image @ AP0_TO_REC709.T, atol=4 * MATRIX_ERROR)
 
 
 def test_gray_and_rec709_are_left_as_they_are(tmp_path):
@@ -505,15 +413,6 @@ def read_free(path):
         with pytest.raises(MemoryError):
             read_image(path)
     return needed[-1]
-
-
-def test_rows_of_tall_tiles_count_before_they_are_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(pixels, "_VALUES", 256 * 32 * 3)
-    image = np.zeros((2048, 32, 3), np.float32)
-    write_tiles(tmp_path / "flat.exr", image, (8, 8))
-    write_tiles(tmp_path / "tall.exr", image, (8, 2048))
-    rows = image[256:].nbytes
-    assert rows < read_free(tmp_path / "tall.exr") - read_free(tmp_path / "flat.exr") < 2 * rows
 
 
 def again(count):
@@ -585,11 +484,6 @@ def test_runs_that_do_not_fill_the_lines_are_refused(data):
         ValueError, match=r"sky\.hdr must be an undamaged hdr file, got: pixels or runs .* 2 lines of 10"
     ):
         read(data, 10, 2)
-
-
-def test_runs_longer_than_the_picture_take_no_memory():
-    with pytest.raises(ValueError, match="do not fill"):
-        read(RED + b"".join(map(again, [255, 255, 255, 255])), 10, 2)
 
 
 def test_flat_pixels_that_look_like_runs_are_pixels_where_the_file_has_all_of_them():
@@ -737,8 +631,13 @@ def test_formats_and_resolutions_of_other_kinds_are_refused():
             read(RED, 1, resolution=size)
 
 
-def test_pictures_that_do_not_fit_into_memory_are_refused(monkeypatch):
-    data = coded(blocks(100, 200), "old runs")
-    monkeypatch.setattr(require, "available_memory", lambda: 34_000_000)  # 33.55 MB are for blocks.
-    with pytest.raises(MemoryError, match=r"sky\.hdr: 200 x 100 pixels"):
-        read(data, 200, 100)
+@pytest.mark.parametrize("name", ["image.exr", "image.hdr", "image.png", "image.jpg"])
+def test_truncated_files_are_refused_by_name(tmp_path, name):
+    path = tmp_path / name
+    image = random_image(64, 64, 3)
+    write_exr(path, image) if name.endswith("exr") else write_oiio(path, image, "uint8")
+    whole = path.read_bytes()
+    for length in (0, 3, 100, len(whole) // 2, len(whole) - 40):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=name):
+            read_image(path)

@@ -228,6 +228,16 @@ def test_a_file_that_does_not_hold_what_was_written_is_not_accepted(tmp_path, mo
     assert sorted(tmp_path.iterdir()) == [path, other]
 
 
+def test_what_is_not_finite_and_large_images_are_written_in_blocks(tmp_path, monkeypatch):
+    monkeypatch.setattr(pixels, "_VALUES", 1)
+    image = random_image(50, 20, 3)
+    image[3, 4], image[40, 2] = [np.nan, np.inf, -np.inf], [-1.0, 1e38, 1e-40]
+    write_exr(tmp_path / "image.exr", image)
+    np.testing.assert_array_equal(read_image(tmp_path / "image.exr")[0], image)
+    for channels in (1, 3, 4):
+        write_png(tmp_path / "image.png", random_image(50, 20, channels))
+
+
 @pytest.mark.parametrize(("write", "suffix"), [(write_exr, ".exr"), (write_png, ".png")])
 def test_directories_pipes_and_devices_are_not_replaced(tmp_path, write, suffix):
     image = random_image(4, 5, 3)
@@ -245,13 +255,3 @@ def test_directories_pipes_and_devices_are_not_replaced(tmp_path, write, suffix)
             write(path, image)
     assert pathlib.Path("/dev/full").is_char_device()
     assert len(list(tmp_path.iterdir())) == 4
-
-
-def test_what_is_not_finite_and_large_images_are_written_in_blocks(tmp_path, monkeypatch):
-    monkeypatch.setattr(pixels, "_VALUES", 1)
-    image = random_image(50, 20, 3)
-    image[3, 4], image[40, 2] = [np.nan, np.inf, -np.inf], [-1.0, 1e38, 1e-40]
-    write_exr(tmp_path / "image.exr", image)
-    np.testing.assert_array_equal(read_image(tmp_path / "image.exr")[0], image)
-    for channels in (1, 3, 4):
-        write_png(tmp_path / "image.png", random_image(50, 20, channels))

@@ -120,7 +120,7 @@ def test_a_center_on_an_edge_belongs_to_the_side_right_of_it_or_below():
     np.testing.assert_array_equal(quad, expected)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_triangles_of_all_sizes_around_the_camera_are_seen_as_ray_tracing_sees_them(seed):
     position, face = _soup(seed, 300)
     camera = _camera(eye=(0.1, 0.2, 0.3), target=(1, 0.4, -1))
@@ -149,20 +149,6 @@ def test_primary_hits_equal_embree():
         assert len(set(face[triangle[i, j]]) & set(face[traced[i, j]])) >= 1
 
 
-def test_an_interpolated_position_lies_on_its_pixels_ray():
-    position, face = _soup(7, 200)
-    camera = _camera(eye=(0, 0, 8), target=(0.3, 0.2, 0), up=(0.2, 1, 0))
-    mesh = _mesh(position, face)
-    fragments = raster.rasterize(mesh, camera)
-    seen = np.asarray(fragments.triangle >= 0)
-    point = pixels.interpolate(fragments, mesh.face, mesh.position)
-    ray = raster.ray_direction(camera)
-    forward = _view_axes(camera)[2]
-    expected = camera.eye + ray * (fragments.depth / (ray @ forward))[..., None]
-    assert seen.mean() > 0.5
-    np.testing.assert_allclose(point[seen], expected[seen], atol=8 * POSITION_TOLERANCE)
-
-
 def test_the_ground_ends_at_the_horizon_though_it_reaches_behind_the_camera():
     camera = _camera(eye=(0, 1, 0), target=(0, 1, -1))
     mesh = _mesh([[-300, 0, -300], [300, 0, -300], [0, 0, 600]], [[0, 1, 2]])
@@ -174,7 +160,7 @@ def test_the_ground_ends_at_the_horizon_though_it_reaches_behind_the_camera():
     np.testing.assert_allclose(fragments.depth[24:], expected, rtol=1e-4)
 
 
-@pytest.mark.parametrize("target", [(0, 0, -1), (1, 0, 0), (0.3, 1, 0.2), (-1, -1, -1), (0, 1, 0)])
+@pytest.mark.parametrize("target", [(1, 0, 0), (-1, -1, -1), (0, 1, 0)])
 def test_inside_a_box_every_pixel_sees_the_wall_that_its_ray_meets(target):
     position, face = _box()
     camera = _camera(eye=(0.1, -0.2, 0.3), target=np.add(target, (0.1, -0.2, 0.3)))
@@ -188,14 +174,6 @@ def test_inside_a_box_every_pixel_sees_the_wall_that_its_ray_meets(target):
     np.testing.assert_allclose(point, eye + reach[..., None] * ray, atol=POSITION_TOLERANCE)
 
 
-def test_a_mesh_behind_the_camera_is_not_seen():
-    position, face = _torus(8, 6)
-    fragments = raster.rasterize(_mesh(position, face), _camera(target=(0, 0, 8)))
-    np.testing.assert_array_equal(fragments.triangle, -1)
-    np.testing.assert_array_equal(fragments.barycentric, 0)
-    np.testing.assert_array_equal(fragments.depth, np.inf)
-
-
 def test_triangles_without_area_draw_nothing():
     position = [[-1, 0, 0], [1, 0, 0], [0, 0, 0], [0, 0, 4], [np.nan, 1, 0], [0, np.inf, 0], [0, 2, 4]]
     face = [[0, 0, 0], [0, 1, 1], [0, 1, 2], [3, 0, 1], [3, 3, 0], [4, 0, 1], [5, 0, 1], [0, 2, 3], [3, 6, 2]]
@@ -206,43 +184,18 @@ def test_triangles_without_area_draw_nothing():
     assert np.all(pixels.render(mesh, mesh.position, camera) == 0)
 
 
-def test_of_coplanar_triangles_the_first_is_seen():
-    position, _ = _soup(3, 1)
-    camera = _camera()
-    one = raster.rasterize(_mesh(position, [[0, 1, 2]]), camera)
-    many = raster.rasterize(_mesh(position, [[0, 1, 2]] * 5), camera)
-    np.testing.assert_array_equal(many.triangle, one.triangle)
-
-
-def test_the_order_and_direction_of_triangles_do_not_change_the_picture():
-    position, face = _torus(20, 12)
-    camera, rng = _camera(eye=(0, 1, 3)), np.random.default_rng(0)
-    order = rng.permutation(len(face))
-    base = raster.rasterize(_mesh(position, face), camera)
-    other = raster.rasterize(_mesh(position, face[order][:, ::-1]), camera)
-    np.testing.assert_array_equal(np.where(other.triangle >= 0, order[other.triangle], -1), base.triangle)
-    np.testing.assert_allclose(other.barycentric[..., ::-1], base.barycentric, atol=1e-5)
-
-
-@pytest.mark.parametrize(("chunk", "triangles"), [(16, 2), (64, 300)])
-def test_more_patches_than_a_chunk_are_all_drawn(monkeypatch, chunk, triangles):
-    position, face = _soup(5, triangles)
+def test_more_patches_than_a_chunk_are_all_drawn(monkeypatch):
+    position, face = _soup(5, 300)
     position[-3:] = [[-1, -1, 3.5], [1, -1, 3.5], [0, 0.2, 3.5]]  # The last alone has more patches than a chunk.
     mesh, camera = _mesh(position, face), _camera()
     whole = raster.rasterize(mesh, camera)
-    assert np.any(whole.triangle == triangles - 1)
+    assert np.any(whole.triangle == 299)
     expected, _, margin = _traced(position, face, camera)
     np.testing.assert_array_equal(whole.triangle[margin > 1e-5], expected[margin > 1e-5])
-    monkeypatch.setattr(raster, "CHUNK", chunk)
+    monkeypatch.setattr(raster, "CHUNK", 64)
     pieces = jax.jit(lambda mesh, camera: raster.rasterize.__wrapped__(mesh, camera))(mesh, camera)
     np.testing.assert_array_equal(pieces.triangle, whole.triangle)
     np.testing.assert_allclose(pieces.depth, whole.depth, rtol=1e-5)
-
-
-def test_a_few_triangles_larger_than_a_large_picture_are_drawn_whole():
-    position, face = _box()
-    camera = _camera(eye=(0.5, 0.2, 0.8), target=(-0.3, -0.1, -1), width=320, height=240)
-    assert np.all(raster.rasterize(_mesh(position, face), camera).triangle >= 0)
 
 
 def test_the_camera_has_up_above_and_right_at_the_right():
@@ -256,7 +209,7 @@ def test_the_camera_has_up_above_and_right_at_the_right():
     np.testing.assert_allclose(ray[0, 0] / -ray[0, 0, 2], [-63 / 48, 47 / 48, -1], atol=1e-6)
 
 
-@pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -3), (0, 0, 0)])
+@pytest.mark.parametrize("up", [(0, 0, -3), (0, 0, 0)])
 def test_an_up_along_the_view_still_gives_a_picture(up):
     camera = _camera(up=up)
     axes = _view_axes(camera)
@@ -298,7 +251,7 @@ def test_an_attribute_may_have_any_trailing_shape():
     np.testing.assert_allclose(deep, jnp.stack([image, image], axis=2), atol=1e-6)
 
 
-@pytest.mark.parametrize("shape", [(3, 3), (5, 3), (4, 0, 3), (4,)])
+@pytest.mark.parametrize("shape", [(3, 3), (4, 0, 3)])
 @pytest.mark.usefixtures("unchecked")
 def test_another_number_of_colors_than_vertices_is_refused(shape):
     mesh = Mesh(jnp.zeros((4, 3)), jnp.zeros((2, 3), jnp.int32), *[jnp.zeros((4, 3))] * 2, jnp.zeros(4, jnp.int32))
@@ -319,16 +272,15 @@ def test_colors_of_whole_numbers_are_drawn(unchecked):
 
 
 # The last test here: it forgets all programs, twice.
-@pytest.mark.parametrize("samples", [1, 4])
-def test_gpus_draw_what_cpus_draw(elsewhere, monkeypatch, samples):
+def test_gpus_draw_what_cpus_draw(elsewhere, monkeypatch):
     position, face = _soup(6, 12, reach=1.5)
     face = np.concatenate([face, face[:6], [[0, 0, 1]]])  # Of equal triangles the first is seen; some have no area.
     mesh, camera = _mesh(position, face), _camera()
-    wide = raster.rasterize(mesh, camera, samples=samples)
+    wide = raster.rasterize(mesh, camera, samples=4)
     monkeypatch.setattr(raster, "WIDE", 64)  # Several steps, some within a triangle.
-    steps = raster.rasterize.__wrapped__(mesh, camera, samples=samples)
+    steps = raster.rasterize.__wrapped__(mesh, camera, samples=4)
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *arguments, cpu, **forms: cpu(*arguments))
-    narrow = raster.rasterize.__wrapped__(mesh, camera, samples=samples)
+    narrow = raster.rasterize.__wrapped__(mesh, camera, samples=4)
     assert 0 < np.mean(np.asarray(narrow.triangle) >= 0) < 1
     for other in (wide, steps):
         np.testing.assert_array_equal(other.triangle, narrow.triangle)

@@ -40,30 +40,12 @@ def test_the_srgb_gradient_is_finite_everywhere(function):
     np.testing.assert_allclose(slope[5:7], ((high - low) / 2e-2)[5:7], rtol=2e-3)
 
 
-def test_the_gradient_of_encoding_at_zero_is_that_of_the_linear_part():
-    assert jax.grad(tonemap.encode_srgb)(0.0) == pytest.approx(12.92)
-
-
-def test_display_is_clamped_and_increasing():
-    shown = np.asarray(tonemap.display(jnp.linspace(-1, 2, 301)))
-    assert shown.min() == 0
-    assert shown.max() == pytest.approx(1, abs=1e-6)
-    assert shown.max() <= 1
-    assert np.all(np.diff(shown) >= 0)
-
-
 def test_automatic_exposure_brings_the_percentile_of_lit_pixels_to_white():
     image = np.zeros((20, 30, 3), np.float32)
     image[:10] = np.random.default_rng(0).exponential(7.0, (10, 30, 1))
     image = jnp.asarray(image)
     shown = tonemap.expose(image, stops=tonemap.automatic_exposure(image, percentile=95.0, white=0.8))
     assert np.percentile(np.asarray(shown)[:10, :, 0], 95) == pytest.approx(0.8, rel=1e-4)
-
-
-def test_automatic_exposure_cancels_a_scale_of_the_image():
-    image = jnp.asarray(np.random.default_rng(0).random((9, 8, 3)), jnp.float32)
-    difference = tonemap.automatic_exposure(image) - tonemap.automatic_exposure(8 * image)
-    assert difference == pytest.approx(3, abs=1e-5)
 
 
 def test_automatic_exposure_of_black_is_zero_stops():

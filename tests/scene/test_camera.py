@@ -1,4 +1,3 @@
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -99,53 +98,9 @@ def test_positions_of_two_numbers_and_pictures_that_cannot_be_counted_are_refuse
         Camera([1.0, 2, 3], [0.0, 0, 0], [0.0, 1, 0], 0.6, 100000, 100000)
 
 
-@pytest.mark.parametrize("place", range(4))
-def test_places_and_angles_that_are_not_finite_are_refused_by_name_unless_they_are_traced(place):
-    value = [[1.0, 2, 3], [0.0, 0, 0], [0.0, 1, 0], 0.6]
-    value[place] = np.nan * np.asarray(value[place])
-    with pytest.raises(
-        ValueError, match=f"the camera's {['eye', 'target', 'up', 'field_of_view'][place]} must be finite"
-    ):
-        Camera(*value, 8, 6)
-    assert jax.eval_shape(lambda each: Camera(*each, 8, 6), value).width == 8
-
-
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"field_of_view": 0.0}, "field_of_view must be between 0 and pi, in radians, got 0"),
-        ({"field_of_view": 45.0}, "field_of_view must be between 0 and pi, in radians, got 45"),
-        ({"target": [1.0, 2, 3]}, "eye and target must be different points"),
-        ({"width": 0}, "width must be a whole number of pixels, at least 1, got 0"),
-        ({"height": -3}, "height must be a whole number of pixels, at least 1, got -3"),
-        ({"width": 32.0}, r"width must be a whole number of pixels, at least 1, got 32\.0"),
-    ],
-)
-@pytest.mark.usefixtures("unchecked")
-def test_cameras_that_see_nothing_are_refused(changed, message):
-    value = {
-        "eye": [1.0, 2, 3],
-        "target": [0.0, 0, 0],
-        "up": [0.0, 1, 0],
-        "field_of_view": 0.6,
-        "width": 8,
-        "height": 6,
-    }
-    assert Camera(**value).height == 6
-    with pytest.raises(ValueError, match=f"the camera's {message}"):
-        Camera(**value | changed)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"width": 0}, "width and height must be at least 1, got 0 x 512"),
-        ({"field_of_view": 0.0}, "field_of_view must be between 0 and pi, got 0"),
-        ({"field_of_view": 3.2}, "field_of_view must be between 0 and pi, got 3.2"),
-        ({"elevation": 1.6}, "elevation must be from -pi/2 to pi/2, got 1.6"),
-        ({"azimuth": float("nan")}, "azimuth must be finite, got nan"),
-    ],
-)
-def test_impossible_cameras_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
-        orbit(sphere(), **options)
+def test_cameras_that_see_nothing_are_refused(unchecked):
+    place = {"eye": [1.0, 2, 3], "target": [0.0, 0, 0], "up": [0.0, 1, 0], "width": 8, "height": 6}
+    with pytest.raises(ValueError, match="the camera's field_of_view must be between 0 and pi, in radians, got 45"):
+        Camera(**place, field_of_view=45.0)
+    with pytest.raises(ValueError, match="the camera's eye and target must be different points"):
+        Camera(**place | {"target": [1.0, 2, 3]}, field_of_view=0.6)

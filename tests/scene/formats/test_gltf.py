@@ -178,15 +178,6 @@ def test_nodes_are_placed_nested_mirrored_and_repeated(tmp_path, close):
     close(part.mesh.normal[8:], np.tile([0.0, 0, 1], (4, 1)), tolerance=1e-6)
 
 
-def test_nodes_scaled_to_almost_nothing_have_finite_frames(tmp_path):
-    writer = one((writer := Writer()).square(NORMAL=np.tile(np.float32([0, 0, 1]), (4, 1))), writer=writer)
-    writer.header["nodes"][0]["scale"] = [1e-30] * 3
-    mesh = load_scene(writer.write(tmp_path / "flat.glb")).mesh
-    assert mesh.position.shape == (4, 3)
-    frame = np.stack([mesh.normal, mesh.tangent], 1)
-    np.testing.assert_allclose(np.linalg.norm(frame, axis=-1), 1, atol=1e-6)
-
-
 def test_parts_are_materials_by_number_and_their_names_are_numbered(tmp_path):
     writer = Writer()
     writer.header["materials"] = [{"name": "wood"}, {"name": "unused"}, {"name": "wood"}, {}]
@@ -238,7 +229,7 @@ def test_all_factors_textures_and_extensions_of_a_material_are_honored(tmp_path,
                 **{"specularColorFactor": [2, 0.5, 1], "specularColorTexture": image},
             },
             "KHR_materials_anisotropy": {
-                **{"anisotropyStrength": 0.7, "anisotropyRotation": 0.3, "anisotropyTexture": image},
+                **{"anisotropyStrength": 0.7, "anisotropyRotation": 0.3, "anisotropyTexture": image}
             },
         },
     }
@@ -454,21 +445,6 @@ def test_buffers_and_images_are_read_from_files_beside(tmp_path):
         load_scene(path)
 
 
-def test_indices_beyond_the_vertices_are_refused(tmp_path):
-    writer = one((writer := Writer()).square(face=np.array([0, 1, 2, 0, 2, 9], np.uint8)), writer=writer)
-    message = r"refer to vertices 0 to 3 in indices of primitive 0 of mesh 0, got 1 of 6 .* first is 9 at 5"
-    with pytest.raises(ValueError, match=message):
-        load_scene(writer.write(tmp_path / "far.glb"))
-
-
-def test_positions_that_are_not_finite_are_refused(tmp_path):
-    position = SQUARE.copy()
-    position[2, 1] = np.nan
-    writer = one((writer := Writer()).square(POSITION=position), writer=writer)
-    with pytest.raises(ValueError, match=r"nan\.glb: positions must be finite, got 1 of 4 .* at vertex 2"):
-        load_scene(writer.write(tmp_path / "nan.glb"))
-
-
 def test_all_textures_are_transformed_and_coats_and_transmission_are_read(tmp_path):
     """KHR_texture_transform on every texture of a material, its channels, and the factors of its layers."""
     writer = Writer()
@@ -568,17 +544,14 @@ def test_lights_are_those_of_three_js(tmp_path):
 
 
 DAMAGE = {
-    r"must refer to one of its 4 lights in node 2, got 4": lambda h, _: h["nodes"][2]["extensions"][LIGHTS].update(
-        light=4
+    r"must refer to one of its 4 lights in node 2, got 4": lambda h, _: h["nodes"][2].update(
+        extensions={LIGHTS: {"light": 4}}
     ),
     r"must have a string for type of light 0, got 3": lambda _, lights: lights[0].update(type=3),
-    r"must have a finite number for intensity of light 1, got inf": lambda _, lights: lights[1].update(
-        intensity=float("inf")
-    ),
+    r"a finite number for intensity of light 1, got nan": lambda _, lights: lights[1].update(intensity=np.nan),
     r"must have an intensity and a color of at least 0 in light 0": lambda _, lights: lights[0].update(intensity=-1),
     r"from 0 to pi / 2 in light 1, got 0\.6 and 0\.5": lambda _, lights: lights[1]["spot"].update(innerConeAngle=0.6),
     r"must have a scale above 0 in node 4 of light 2": lambda h, _: h["nodes"][4].update(scale=[1, 1, 0]),
-    r"must have a list for lights of KHR_lights_punctual": lambda h, _: h["extensions"][LIGHTS].update(lights=1),
 }
 
 
@@ -599,3 +572,10 @@ def test_what_is_not_read_of_lights_is_named_once(tmp_path):
     with pytest.warns(UserWarning, match=message):
         scene = load_scene(writer.write(tmp_path / "a.glb"))
     assert not scene.suns
+
+
+def test_indices_beyond_the_vertices_are_refused(tmp_path):
+    writer = one((writer := Writer()).square(face=np.array([0, 1, 2, 0, 2, 9], np.uint8)), writer=writer)
+    message = r"refer to vertices 0 to 3 in indices of primitive 0 of mesh 0, got 1 of 6 .* first is 9 at 5"
+    with pytest.raises(ValueError, match=message):
+        load_scene(writer.write(tmp_path / "far.glb"))

@@ -121,93 +121,50 @@ def outcome(path: pathlib.Path) -> str:
 
 ROWS = [1, 0, 0, 5, 0, 1, 0, 6, 0, 0, 1, 7, 0, 0, 0, 1]  # of a matrix, which must be by columns
 # One case for each kind of check; the test of all values of a header reaches the others.
+PRIMITIVE, PBR = ("meshes", 0, "primitives", 0), ("materials", 0, "pbrMetallicRoughness")
 TYPES = [
-    (("nodes", 0, "mesh"), True, r"must refer to one of its 2 meshes in node 0, got True"),
-    (("nodes", 0, "mesh"), "0", r"must refer to one of its 2 meshes in node 0, got '0'"),
-    (("nodes", 0, "mesh"), 10**400, r"must refer to one of its 2 meshes in node 0, got 10{79}\.\.\.$"),
-    (("nodes", 0, "mesh"), 0.5, r"must refer to one of its 2 meshes in node 0, got 0\.5"),
-    (("nodes", 0, "children"), 1, r"must have a list for children of node 0, got 1"),
-    (("nodes", 0, "rotation"), [0, 0, False, 1], r"must have 4 finite numbers for the rotation of node 0, got"),
-    (("nodes", 0, "rotation"), [0, 0, 10**400, 1], r"must have 4 finite numbers for the rotation of node 0, got"),
-    (("nodes", 1, "scale"), [[1], [1], [1]], r"must have 3 finite numbers for the scale of node 1"),
-    (("nodes", 0, "extensions"), [], r"must have an object for extensions of node 0, got \[\]"),
+    (("nodes", 0, "mesh"), True, r"refer to one of its 2 meshes in node 0, got True"),
+    (("nodes", 0, "mesh"), 10**400, r"refer to one of its 2 meshes in node 0, got 10{79}\.\.\.$"),
+    (("nodes", 0, "mesh"), 0.5, r"refer to one of its 2 meshes in node 0, got 0\.5"),
+    (("nodes", 0, "children"), 1, r"have a list for children of node 0, got 1"),
+    (("nodes", 0, "rotation"), [0, 0, 10**400, 1], r"have 4 finite numbers for the rotation of node 0, got"),
+    (("nodes", 0, "extensions"), [], r"have an object for extensions of node 0, got \[\]"),
     (("nodes", 2), "node", r"with a list of nodes, all of them objects, got 'node' at 2"),
-    (("nodes",), {"0": {}}, r"with a list of nodes, got dict"),
     (("scenes", 0, "nodes"), [0, 0], r"nodes that form trees, got node 0 twice, the second time in scene 0"),
     (
         ("accessors", 0, "count"),
         5,
         r"keep accessor 0 \(POSITION of primitive 0 of mesh 0\) inside .* of 48 bytes, got 5",
     ),
-    (
-        ("accessors", 0, "byteOffset"),
-        -4,
-        r"whole number of at least 0 for byteOffset of accessor 0 \(POSITION .*, got -4",
-    ),
-    (
-        ("accessors", 0, "componentType"),
-        5130,
-        "must have 3 numbers per element .* got type 'VEC3' of component type 5130",
-    ),
-    (("accessors", 1, "count"), 3, r"must have 4 elements in TEXCOORD_0 .*, as in POSITION, got 3"),
-    (("accessors", 3, "componentType"), 5126, "must have 1 whole numbers per element"),
-    (
-        ("accessors", 3, "bufferView"),
-        99,
-        r"refer to one of its \d+ bufferViews in accessor 3 \(indices of .*\), got 99",
-    ),
-    (("meshes", 0, "primitives", 0, "attributes"), {}, "be an undamaged glTF file, got one that lacks 'POSITION'"),
-    (("nodes", 0, "children"), [0], "must have nodes that form trees, got node 0 twice, the second time in node 0"),
-    (("nodes", 1, "camera"), -1, "must refer to one of its 1 cameras in node 1, got -1"),
-    (("nodes", 1, "scale"), [0, 0, 0], "must have invertible transforms for camera 0, got a scale of zero"),
-    (
-        ("nodes", 2, "matrix"),
-        ROWS,
-        r"by columns, the last row of which is 0 0 0 1, in node 2, got \[5\.0, 6\.0, 7\.0, 1\.0\]",
-    ),
-    (("nodes", 0, "rotation"), [0, 0, 0, 0], "must have a nonzero quaternion for the rotation of node 0, got zero"),
-    (("nodes", 1, "translation"), [0, NAN, 0], "must have 3 finite numbers for the translation of node 1, got"),
-    (("scenes", 0), {}, "must hold vertices and faces, got no faces"),
-    (
-        ("materials", 0, "pbrMetallicRoughness", "metallicFactor"),
-        NAN,
-        "a finite number for metallicFactor of material 0",
-    ),
-    (("materials", 0, "pbrMetallicRoughness", "baseColorFactor"), [1, 1, 1], "4 finite numbers for baseColorFactor"),
-    (("materials", 0, "pbrMetallicRoughness", "roughnessFactor"), 1.5, r"be between 0 and 1, .* 1\.5"),
+    (("accessors", 0, "byteOffset"), -4, r"number of at least 0 for byteOffset of accessor 0 \(POSITION .*, got -4"),
+    (("accessors", 0, "componentType"), 5130, "have 3 numbers per element .* got type 'VEC3' of component type 5130"),
+    (("accessors", 0, "count"), 0, r"have 1 or more elements in accessor 0 \(POSITION .*\), got 0"),
+    (("accessors", 0, "count"), 2**53, r"keep accessor 0 .* inside buffer view \d of 48 bytes"),
+    (("accessors", 0, "normalized"), 1, r"have true or false for normalized of accessor 0 .* got 1"),
+    (("accessors", 0, "sparse", "count"), 5, r"replace 1 to 4 elements, .* got 5 of component type 5121"),
+    (("accessors", 1, "count"), 3, r"have 4 elements in TEXCOORD_0 .*, as in POSITION, got 3"),
+    (("accessors", 3, "componentType"), 5126, "have 1 whole numbers per element"),
+    ((*PRIMITIVE, "attributes"), {}, "be an undamaged glTF file, got one that lacks 'POSITION'"),
+    ((*PRIMITIVE, "mode"), 7, r"have a mode from 0 to 6 in primitive 0 of mesh 0, got 7"),
+    (("meshes", 0, "primitives"), [4], r"have an object for primitive 0 of mesh 0, got 4"),
+    (("nodes", 1, "scale"), [0, 0, 0], "have invertible transforms for camera 0, got a scale of zero"),
+    (("nodes", 2, "matrix"), ROWS, r"the last row of which is 0 0 0 1, in node 2, got \[5\.0, 6\.0, 7\.0, 1\.0\]"),
+    (("nodes", 0, "rotation"), [0, 0, 0, 0], "have a nonzero quaternion for the rotation of node 0, got zero"),
+    (("scenes", 0), {}, "hold vertices and faces, got no faces"),
+    ((*PBR, "metallicFactor"), NAN, "a finite number for metallicFactor of material 0"),
+    ((*PBR, "baseColorFactor"), [1, 1, 1], "4 finite numbers for baseColorFactor"),
+    ((*PBR, "roughnessFactor"), 1.5, r"be between 0 and 1, .* 1\.5"),
     (("materials", 0, "normalTexture", "index"), 4, r"one of its 1 textures in \w+Texture of material 0"),
-    (("cameras", 0, "perspective", "yfov"), 4, "must have yfov from 0 to pi"),
+    (("cameras", 0, "perspective", "yfov"), 4, "have yfov from 0 to pi"),
+    (("skins", 0, "joints"), [], r"have one or more joints in skin 0, got none"),
+    (("bufferViews", 1, "byteLength"), 2**52, r"have buffers of at least \d+ bytes for buffer view 1"),
+    (("bufferViews", 3, "byteStride"), 3, r"keep accessor 0 .* each 3 bytes"),
+    (("bufferViews", 3, "byteStride"), 2**50, r"keep accessor 0 .* inside buffer view 3"),
+    (("images", 0), {"uri": 5}, r"name a file or hold data in image 0, got 5"),
     (("asset", "version"), "1.0", "of version 2, got version 1.0"),
-    (("extensionsRequired",), ["EXT_a", "EXT_b"], "must not require extensions other than .*, got EXT_a, EXT_b$"),
-    (("accessors",), "none", "with a list of accessors, got str"),
-    (("skins", 0, "joints"), [], r"must have one or more joints in skin 0, got none"),
-    (("meshes", 0, "primitives"), [4], r"must have an object for primitive 0 of mesh 0, got 4"),
-    (("meshes", 0, "primitives", 0, "mode"), 7, r"must have a mode from 0 to 6 in primitive 0 of mesh 0, got 7"),
-    (
-        ("meshes", 0, "primitives", 0, "mode"),
-        True,
-        r"whole number of at least 0 for mode of primitive 0 of mesh 0, got T",
-    ),
-    (("accessors", 0, "count"), 0, r"must have 1 or more elements in accessor 0 \(POSITION .*\), got 0"),
-    (("accessors", 0, "count"), 4.5, r"whole number of at least 0 for count of accessor 0 .* got 4\.5"),
-    (("accessors", 0, "count"), 2**53, r"must keep accessor 0 .* inside buffer view \d of 48 bytes"),
-    (("accessors", 0, "type"), ["VEC3"], r"must have a string for type of accessor 0 .* got \['VEC3'\]"),
-    (("accessors", 0, "normalized"), 1, r"must have true or false for normalized of accessor 0 .* got 1"),
-    (("accessors", 0, "sparse", "count"), 5, r"must replace 1 to 4 elements, .* got 5 of component type 5121"),
-    (("bufferViews", 1, "byteLength"), "9", r"whole number of at least 0 for byteLength of buffer view 1, got '9'"),
-    (("bufferViews", 1, "byteLength"), 2**52, r"must have buffers of at least \d+ bytes for buffer view 1"),
-    (("bufferViews", 3, "byteStride"), 3, r"must keep accessor 0 .* each 3 bytes"),
-    (("bufferViews", 3, "byteStride"), 2**50, r"must keep accessor 0 .* inside buffer view 3"),
-    (
-        ("materials", 0, "pbrMetallicRoughness", "metallicFactor"),
-        True,
-        r"a finite number for metallicFactor of material 0",
-    ),
-    (("images", 0), {"uri": 5}, r"must name a file or hold data in image 0, got 5"),
-    (("cameras", 0, "perspective"), {}, r"must have a finite number for yfov of camera 0, got None"),
-    (("asset", "version"), [2], r"of version 2, got version \[2\]"),
-    (("asset", "minVersion"), "2.1", r"must be a glTF file that needs no more than version 2\.0, got minVersion 2\.1"),
-    (("extensionsUsed",), ["KHR_a", 3], r"must have a list of strings for extensionsUsed of the file, got 3 in it"),
+    (("asset", "minVersion"), "2.1", r"be a glTF file that needs no more than version 2\.0, got minVersion 2\.1"),
+    (("extensionsRequired",), ["EXT_a", "EXT_b"], "not require extensions other than .*, got EXT_a, EXT_b$"),
+    (("extensionsUsed",), ["KHR_a", 3], r"have a list of strings for extensionsUsed of the file, got 3 in it"),
 ]
 
 
@@ -215,7 +172,7 @@ TYPES = [
 def test_fields_of_wrong_types_are_refused_by_name(tmp_path, way, value, message):
     writer = everything(tmp_path)
     writer.header = changed(writer.header, way, value)
-    with pytest.raises(ValueError, match=rf"wrong\.glb.* must .*{message.removeprefix('must ')}"):
+    with pytest.raises(ValueError, match=rf"wrong\.glb.* must .*{message}"):
         load_scene(writer.write(tmp_path / "wrong.glb"))
 
 
@@ -237,17 +194,6 @@ def test_files_that_are_cut_off_or_something_else_are_refused(tmp_path):
         load_scene(tmp_path / "absent.glb")
 
 
-def test_required_extensions_must_be_a_list_of_strings_for_meshes_too(tmp_path):
-    writer = everything(tmp_path)
-    for value in ("KHR", [1], {}):
-        writer.header["extensionsRequired"] = value
-        for load in (load_scene, load_mesh):
-            with pytest.raises(
-                ValueError, match=r"a\.glb must have a list (of strings )?for extensionsRequired of the file"
-            ):
-                load(writer.write(tmp_path / "a.glb"))
-
-
 def test_what_is_not_used_may_be_damaged_and_extras_may_be_anything(tmp_path):
     writer = everything(tmp_path)
     path = tmp_path / "a.glb"
@@ -262,25 +208,6 @@ def test_what_is_not_used_may_be_damaged_and_extras_may_be_anything(tmp_path):
     np.testing.assert_array_equal(load_scene(writer.write(path)).mesh.position, expected.position)
 
 
-def test_whole_numbers_may_be_written_with_a_fraction_of_zero(tmp_path):
-    writer = everything(tmp_path)
-    expected = load_scene(writer.write(tmp_path / "a.glb")).mesh
-    for way, value in (
-        (("nodes", 0, "mesh"), 0.0),
-        (("accessors", 0, "count"), 4.0),
-        (("bufferViews", 3, "byteLength"), 48.0),
-    ):
-        writer.header = changed(writer.header, way, value)
-    np.testing.assert_array_equal(load_scene(writer.write(tmp_path / "a.glb")).mesh.position, expected.position)
-
-
-def test_names_that_stand_twice_in_an_object_are_refused(tmp_path):
-    text = everything(tmp_path).write(tmp_path / "a.gltf").read_text()
-    (tmp_path / "a.gltf").write_text(text.replace('"scene": 0', '"scene": 0, "scene": 0'))
-    with pytest.raises(ValueError, match=r"a\.gltf must .* not JSON: an object has the name 'scene' 2 times"):
-        load_scene(tmp_path / "a.gltf")
-
-
 def test_headers_may_start_with_a_byte_order_mark(tmp_path):
     path = everything(tmp_path).write(tmp_path / "a.gltf")
     expected = load_scene(path).mesh
@@ -293,22 +220,6 @@ def test_headers_may_start_with_a_byte_order_mark(tmp_path):
     marked = glb[:8] + size + glb[16:20] + codecs.BOM_UTF8 + b" " + glb[20:]
     (tmp_path / "b.glb").write_bytes(marked)
     np.testing.assert_array_equal(load_mesh(tmp_path / "b.glb").position, SQUARE)
-
-
-def test_headers_of_depths_and_digits_without_end_are_refused(tmp_path):
-    path = tmp_path / "a.gltf"
-    for text in (
-        "[" * 100_000,
-        '{"a":' * 100_000,
-        "9" * 5000,
-        '{"asset": {"version": ' + "9" * 5000 + "}}",
-        "",
-        "null",
-        "3",
-    ):
-        path.write_text(text)
-        with pytest.raises(ValueError, match=r"a\.gltf must be an undamaged glTF file"):
-            load_scene(path)
 
 
 def test_images_that_cannot_be_read_are_left_out_and_named(tmp_path):
@@ -334,14 +245,6 @@ def test_images_that_cannot_be_read_are_left_out_and_named(tmp_path):
         assert load_scene(writer.write(path))["a"].material.textures == ()
 
 
-def test_signaling_nans_are_refused_like_others(tmp_path):
-    position = SQUARE.copy()
-    position.view(np.uint32)[1, 2] = 0x7FA00000
-    writer = one((writer := Writer()).square(POSITION=position), writer=writer)
-    with pytest.raises(ValueError, match=r"a\.glb: positions must be finite, got 1 of 4"):
-        load_scene(writer.write(tmp_path / "a.glb"))
-
-
 def test_names_of_materials_can_be_written_to_files(tmp_path):
     writer = one((writer := Writer()).square(material=0), writer=writer)
     for name, expected in (("\ud800x", "?x"), (7, "7"), ("", "material 0"), (None, "material 0"), ("häuser", "häuser")):
@@ -351,20 +254,8 @@ def test_names_of_materials_can_be_written_to_files(tmp_path):
 
 
 EXTREMES = [None, True, False, 0, -1, 1, 3, 2**31, 2**32, 2**53, 2**63, 10**30, 10**400, 0.5, -0.0, 1e308, NAN, NAN * 2]
-EXTREMES += [
-    float("inf"),
-    "",
-    "text",
-    "../../../../etc/passwd",
-    "\0",
-    [],
-    {},
-    [[]],
-    [0] * 3,
-    ["x"],
-    {"a": 1},
-    [1e300] * 16,
-]
+EXTREMES += [float("inf"), "", "text", "../../../../etc/passwd", "\0", [], {}, [[]], [0] * 3, ["x"], {"a": 1}]
+EXTREMES += [[1e300] * 16]
 
 
 def mutated(content: bytes, path: pathlib.Path, rng: random.Random, header: dict, writer: Writer) -> None:
@@ -482,10 +373,7 @@ def patched(writer: Writer, place: int, value: bytes) -> bytes:
     ("change", "message"),
     [
         (lambda w: {"content": content_of(w)[:-9]}, "an undamaged mesh of Draco in .* of primitive 0 of mesh 0, got"),
-        (lambda w: {"content": content_of(w)[:9]}, "an undamaged mesh of Draco"),
-        (lambda w: {"content": patched(w, 0, b"OCARD")}, "an undamaged mesh of Draco .* got data that start b'OCARD"),
         # The first number after the header of 11 bytes is that of triangles.
-        (lambda w: {"content": patched(w, 11, b"\xff\xff\xff\xff")}, "undamaged mesh of Draco|2 triangles"),
         (lambda w: {"content": patched(w, 12, b"\x7f")}, "2 triangles and 4 vertices .* got 2 triangles and 127 vert"),
         (lambda w: {"attributes": {"POSITION": 77}}, "4 elements of 3 in POSITION of KHR_draco.*, got none"),
         (lambda w: {"attributes": {"NORMAL": 0}}, "POSITION and indices in KHR_draco"),
@@ -498,21 +386,6 @@ def test_damaged_draco_data_are_refused(tmp_path, change, message):
     writer = Writer()
     one(draco(writer, **options), writer=writer)
     with pytest.raises(ValueError, match=rf"a\.glb .*({message})"):
-        load_scene(writer.write(tmp_path / "a.glb"))
-
-
-def test_counts_of_draco_accessors_are_those_of_the_data_and_fit_into_memory(tmp_path, monkeypatch):
-    writer = Writer()
-    one(draco(writer), writer=writer)
-    index = writer.header["meshes"][0]["primitives"][0]["indices"]
-    for number in range(index + 1):
-        writer.header["accessors"][number]["count"] = 3 * 10**9
-    with pytest.raises(ValueError, match="decoded bytes for each byte of KHR_draco_mesh_compression"):
-        load_scene(writer.write(tmp_path / "a.glb"))
-    for number in range(index + 1):
-        writer.header["accessors"][number]["count"] = 3 * 10**4
-    monkeypatch.setattr(require, "available_memory", lambda: 10**6)
-    with pytest.raises(MemoryError, match=r"the decoded data of .*a\.glb"):
         load_scene(writer.write(tmp_path / "a.glb"))
 
 
@@ -580,9 +453,7 @@ def test_views_of_meshoptimizer_are_decoded(tmp_path, name, suffix):
         ({"byteLength": 10**6}, "buffers of at least 1000000 bytes for the compressed data of buffer view 0"),
         ({"mode": "VERTICES"}, "one of the modes ATTRIBUTES, TRIANGLES, INDICES .* got 'VERTICES' and 'NONE'"),
         ({"filter": "LINEAR"}, "of the filters NONE, OCTAHEDRAL, .* got 'ATTRIBUTES' and 'LINEAR'"),
-        ({"filter": "QUATERNION"}, "undamaged data of meshoptimizer"),
         ({"byteStride": 10}, "elements of multiples of 4 up to 256 bytes .* got 10 bytes"),
-        ({"mode": "INDICES"}, "elements of 2 or 4 bytes .* got 12 bytes"),
         ({"count": 5}, "must have 48 decoded bytes .* got 5 elements of 12 bytes"),
         ({"buffer": 9}, "must refer to one of its 2 buffers in the compressed data of buffer view 0"),
     ],

@@ -191,14 +191,6 @@ def test_what_has_no_equal_is_said_by_name():
     assert message == f"the dictionary: not supported and ignored are {expected}"
 
 
-def test_cameras_at_map_coordinates_keep_their_digits():
-    place = np.eye(4)
-    place[:3, 3] = 512345.3, 100.7, 4987649.3
-    camera = {"type": "perspective", "fov": 40.0, "to_world": place}
-    scene = load_scene({"type": "scene", "sheet": {"type": "rectangle", "to_world": place}, "camera": camera})
-    np.testing.assert_array_equal(scene.cameras[0].eye, place[:3, 3])
-
-
 def test_films_and_crops_of_a_sensor_are_read_or_said_by_name():
     film = {"type": "hdrfilm", "width": np.int64(8), "height": 6, "crop_width": 4, "rfilter": {"type": "box"}}
     eye = {"type": "perspective", "fov": 40, "near_clip": 0.1, "principal_point_offset_x": 0.2, "film": film}
@@ -208,13 +200,6 @@ def test_films_and_crops_of_a_sensor_are_read_or_said_by_name():
         (camera,) = load_scene(scene).cameras
     assert (camera.width, camera.height) == (8, 6)
     assert 2 * np.arctan(np.tan(np.radians(20)) * 6 / 8) == pytest.approx(float(camera.field_of_view))
-
-
-def test_a_rectangle_that_is_flattened_along_its_normal_keeps_its_area():
-    flat = {"type": "rectangle", "to_world": np.diag([2, 3, 0, 1])}
-    (part,) = load_scene({"type": "scene", "sheet": flat}).parts
-    np.testing.assert_allclose(np.ptp(np.asarray(part.mesh.position), axis=0), [4, 6, 0])
-    np.testing.assert_allclose(np.asarray(part.mesh.normal)[0], [0, 0, 1])
 
 
 LOOP, LOOP_OF_BSDFS = [], {"type": "twosided"}
@@ -241,80 +226,44 @@ def sensor(**field):
         ({"type": "shape"}, "must have the type 'scene', got 'shape'"),
         ({"sheet": 3}, "sheet must be a dictionary, got one of class int"),
         ({"sheet": {"type": "disk"}}, "a scene must have at least one part, got none"),
-        (
-            {"sheet": {"type": "rectangle", "bsdf": {"type": "dielectric"}}},
-            "bsdf of sheet must be one of .* got 'dielectric'",
-        ),
-        (
-            {"sheet": {"type": "rectangle", "bsdf": {"type": "ref", "id": "x"}}},
-            "sheet must refer to something .* got 'x'",
-        ),
-        ({"sheet": {"type": "rectangle", "bsdf": {"type": "roughconductor"}}}, "must have eta and k or .*, got 'Cu'"),
+        (matte(type="dielectric"), "bsdf of sheet must be one of .* got 'dielectric'"),
+        (shape(bsdf={"type": "ref", "id": "x"}), "sheet must refer to something .* got 'x'"),
+        (matte(type="roughconductor"), "must have eta and k or .*, got 'Cu'"),
         ({"sheet": {"type": "rectangle", "to_world": np.eye(3)}}, "to_world of sheet must be a finite 4 x 4 matrix"),
         ({"sheet": {"type": "obj", "filename": "a.ply"}}, r"filename of sheet must end in \.obj, got 'a\.ply'"),
-        (
-            {"sheet": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 2}}},
-            "sheet: base_color .* 0 and 1",
-        ),
-        (
-            {"sheet": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}}},
-            "reflectance of bsdf of sheet must be a number, a color, or a texture of the type bitmap",
-        ),
+        (matte(reflectance=2), "sheet: base_color .* 0 and 1"),
+        (matte(reflectance={"type": "checkerboard"}), "must be a number, a color, or a texture of the type bitmap"),
         ({"eye": {"type": "perspective"}}, "eye must have fov, and no focal_length, got type"),
         ({"sky": {"type": "envmap"}}, "sky must have a filename, got type"),
         ({3: {"type": "cube"}}, "names in a scene must be text, got 3"),
-        *[({"sheet": {"type": kind}}, "sheet must have a type, as text, got") for kind in (None, 3, ["cube"])],
-        *[(shape(bsdf=x), "bsdf of sheet must be a dictionary with a type, got") for x in ("x", None, [1], 3, [LOOP])],
+        *[({"sheet": {"type": kind}}, "sheet must have a type, as text, got") for kind in (None, ["cube"])],
+        *[(shape(bsdf=x), "bsdf of sheet must be a dictionary with a type, got") for x in (None, [LOOP])],
         *[(shape(bsdf=x), "bsdf of sheet must have a type, as text, got") for x in ({}, {"type": [1]})],
         (shape(bsdf=LOOP_OF_BSDFS), "bsdf of sheet must hold at most 16 BSDFs in each other, got more, or one that"),
         ({"m": {"type": "ref", "id": "m"}} | shape(bsdf={"type": "ref", "id": "m"}), "bsdf of sheet must refer to"),
         (shape(bsdf={"type": "twosided"}), "bsdf of sheet must hold a BSDF, got type"),
         (shape(a={"type": "diffuse"}, b={"type": "diffuse"}), "sheet must have at most one BSDF and one emitter"),
-        (
-            shape(a={"type": "area"}, b={"type": "area"}),
-            "sheet must have at most one BSDF and one emitter, got 0 and 2",
-        ),
         (shape(to_world=np.zeros((4, 4))), "the last row of to_world of sheet must be zeros and 1, got"),
-        (shape(to_world=np.diag([1, 1, 1, 2])), "the last row of to_world of sheet must be zeros and 1, got"),
         (shape(to_world=np.diag([1, 0, 0, 1])), "to_world of sheet must leave the shape an area, got"),
-        (shape(to_world=[[1], [1, 2]]), "to_world of sheet must be a finite 4 x 4 matrix"),
         (shape(flip_normals="false"), "flip_normals of sheet must be True or False, got 'false'"),
-        (shape(type="obj", filename=3), "filename of sheet must be a path"),
-        *[(shape(type="sphere", radius=x), "radius of sheet must be .*, got") for x in (0, -1, "1", None, [1], np.inf)],
-        *[(shape(type="sphere", center=x), "center of sheet must be three") for x in ([0, 0], "x", {}, [1, 2, [3]])],
+        *[(shape(type="sphere", radius=x), "radius of sheet must be .*, got") for x in (0, "1", np.inf)],
+        *[(shape(type="sphere", center=x), "center of sheet must be three") for x in ([0, 0], {})],
         (matte(reflectance=LOOP), "reflectance of bsdf of sheet must be a finite number or color, got"),
         (matte(reflectance=TILE | {"filename": None}), "filename of reflectance of bsdf of sheet must be a path"),
         (matte(reflectance=TILE | {"wrap_mode": "x"}), "wrap_mode of .* must be one of repeat, mirror, clamp, got 'x'"),
-        (
-            matte(reflectance=TILE | {"to_uv": np.ones((3, 3))}),
-            "the last row of to_uv of reflectance of .* zeros and 1",
-        ),
-        (
-            matte(type="principled", specular=12.5),
-            "specular of bsdf of sheet must be at least 0 and at most 1, got 12.5",
-        ),
-        (matte(type="principled", anisotropic="x"), "anisotropic of bsdf of sheet must be real numbers, got"),
-        (
-            matte(type="principled", roughness=[0.1, 0.2, 0.3]),
-            "roughness of bsdf of sheet must be one number or a bitm",
-        ),
         (matte(type="plastic", ext_ior=0), "ext_ior of bsdf of sheet must be above 0 and at most"),
-        (matte(type="plastic", int_ior="bk7"), "int_ior of bsdf of sheet must be real numbers, got the text 'bk7'"),
         (matte(type="conductor", eta=-1, k=0), "bsdf of sheet must have eta and k of at least 0, got"),
         (matte(type="conductor", material="none", specular_reflectance=2), "sheet: base_color .* between 0 and 1"),
         (matte(type="roughconductor", eta=1, k=1, distribution="x"), "distribution of bsdf of sheet must be one of"),
-        *[(sensor(fov=x), "fov of eye must be .*, got") for x in (0, 360, -40, "40", None, [40])],
+        *[(sensor(fov=x), "fov of eye must be .*, got") for x in (0, 360, "40")],
         (sensor(fov=180), "eye: the camera's field_of_view must be between"),
         (sensor(film="x"), "film of eye must be a dictionary with a type, got 'x'"),
-        *[(sensor(film=FILM | {"width": x}), "width of the film of eye must be .*, got") for x in (0, 8.5, "8", True)],
+        *[(sensor(film=FILM | {"width": x}), "width of the film of eye must be .*, got") for x in (0, 8.5)],
         *[(sensor(to_world=np.diag([x, 1, 1, 1])), "to_world of eye must be a pure rotation") for x in (0, -1, 2)],
-        *[({"sky": {"type": "constant", "radiance": x}}, "radiance of sky must be") for x in ("x", [1, 2], {}, np.nan)],
-        ({"sky": {"type": "constant", "radiance": -1}}, "radiance of sky must be at least 0, got"),
+        *[({"sky": {"type": "constant", "radiance": x}}, "radiance of sky must be") for x in ("x", [1, 2], np.nan)],
         (matte(type="principled", specular=0.5, eta=1.9), "bsdf of sheet must have specular or eta, got both"),
         (matte(reflectance={"type": "rgb", "value": 0.5, "scale": 2}), "must have a type and a value alone, got type"),
         (sensor(film=FILM, other=FILM), "eye must have one film, got two"),
-        ({"sky": {"type": "envmap", "filename": "x.exr", "scale": "2"}}, "scale of sky must be real numbers, got"),
-        ({"sky": {"type": "envmap", "filename": None}}, "filename of sky must be a path"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*disk")

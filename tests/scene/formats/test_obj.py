@@ -52,14 +52,6 @@ def test_byte_order_marks_and_line_ends_change_nothing(tmp_path, encoding, end):
     np.testing.assert_array_equal(part.material.base_color, [1, 0, 0])
 
 
-def test_names_in_windows_1252_are_read(tmp_path):
-    write(tmp_path, "newmtl Weiß …\nKd 1 0 0\n".encode("cp1252"), "Möbel.mtl")
-    text = "mtllib Möbel.mtl\n" + TRIANGLE.replace("f ", "usemtl Weiß …\nf ")
-    (part,) = load_scene(write(tmp_path, text.encode("cp1252"))).parts
-    assert part.name == "Weiß …"
-    np.testing.assert_array_equal(part.material.base_color, [1, 0, 0])
-
-
 @pytest.mark.parametrize("content", [TRIANGLE.encode("utf-16-le"), b"\xff\xfe" + b"\x00\xd8" * 3, b"v 0 0\0 0\n"])
 def test_what_is_not_text_is_refused(tmp_path, content):
     with pytest.raises(ValueError, match=r"scene\.obj must be an undamaged OBJ file, got one that is not text"):
@@ -100,14 +92,6 @@ def test_vertices_without_color_stay_gray(tmp_path, missing):
     np.testing.assert_array_equal(part.mesh.position, POSITION)
 
 
-def test_positions_keep_the_digits_of_the_file(tmp_path):
-    text = "v 512345.678912345 4987654.321098765 0\nv 512346.678912345 4987654.321098765 0\n"
-    text += "v 512345.678912345 4987655.321098765 1e-3\nf 1 2 3\n"
-    position = mesh_file.read(write(tmp_path, text), groups=False).position
-    np.testing.assert_array_equal(position[0], [512345.678912345, 4987654.321098765, 0])
-    assert position.dtype == np.float64
-
-
 def test_corners_of_different_form_may_be_mixed(tmp_path):
     text = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvn 0 0 2\n"
     text += "f 1/1 2/2 3/3\nf 1//1 3//1 4//1\nf 1/1/1 2/2/1 4//1\nf 1 2 3\nf 1/ 2// 3\n"
@@ -132,26 +116,16 @@ def test_faces_with_missing_normals_are_loaded_without_them_and_a_warning_says_s
     ("line", "message"),
     [
         ("f 1 2", "three or more of the vertices 1 to ., got 1 of . faces that do not, the first is 'f 1 2' in line 6"),
-        ("f", "the first is 'f' in line 6"),
         ("f 0/0/0 1/1/1 2/2/2", "the first is 'f 0/0/0 1/1/1 2/2/2' in line 6"),
         ("f 1 2 99999999999999999999999999", "in line 6"),
-        ("f 1 2 -4611686018427387904", "in line 6"),
         ("f 1 2 -4", "in line 6"),
-        ("f 1 2 3.5", "the first is 'f 1 2 3.5' in line 6"),
         ("f /1 /2 /3", "in line 6"),
         ("v 1 2", "v has 3 or more numbers, got 'v 1 2' in line 6"),
-        ("v", "v has 3 or more numbers, got 'v' in line 6"),
         ("v 1 x 2", "v has 3 or more numbers, got 'v 1 x 2' in line 6"),
-        ("v 1,5 2 3", "got 'v 1,5 2 3' in line 6"),
-        ("v 1-2 3 4 5", "got 'v 1-2 3 4 5' in line 6"),
         ("v 1_0 0 0", "v has 3 or more numbers, got 'v 1_0 0 0' in line 6"),
-        ("f 1_0 2 3", "the first is 'f 1_0 2 3' in line 6"),
         (f"f 1 2 {'1' * 5000}", "the first is 'f 1 2 1111"),
-        ("f 1/1/1/9 2 3", "the first is 'f 1/1/1/9 2 3' in line 6"),
         ("f 1/// 2/// 3///", "the first is 'f 1/// 2/// 3///' in line 6"),
-        ("vt", "vt has 1 or more numbers, got 'vt' in line 6"),
         ("vn 1 0", "vn has 3 or more numbers, got 'vn 1 0' in line 6"),
-        ("v nan 0 0\nf 1 2 4", "positions must be finite, got 1 of 4 that are not, the first is 'v nan 0 0' in line 6"),
         ("v 1e999 0 0\nf 1 2 4", "positions must be finite, .* the first is 'v 1e999 0 0' in line 6"),
     ],
 )
@@ -159,11 +133,11 @@ def test_damaged_statements_are_refused_with_their_line(tmp_path, line, message)
     text = TRIANGLE.replace("f 1 2 3", "f 1 \\\n 2 3")
     with pytest.raises(ValueError, match=rf"scene\.obj.*{message}"):
         load_mesh(write(tmp_path, text + line))
-    with pytest.raises(ValueError, match=rf"scene\.obj.*{message}"):  # among statements of several blocks
-        load_mesh(write(tmp_path, text + line + "\n# nothing" * 70000 + "\nv 0 0 0\nf 1 2 3"))
 
 
-def test_statements_in_different_blocks_belong_together(tmp_path):
+def test_statements_in_different_blocks_belong_together_and_have_their_lines(tmp_path):
+    with pytest.raises(ValueError, match=r"scene\.obj.*got 'v 1 x 2' in line 5"):
+        load_mesh(write(tmp_path, TRIANGLE + "v 1 x 2" + "\n# nothing" * 70000 + "\nv 0 0 0\nf 1 2 3"))
     text = "v 0 0 0\n" + "\n" * 70000 + "v 1 0 0\nv 0 1 0 # far\nusemtl a\nf -3 -2 -1\n" + "#\n" * 70000
     text += "usemtl b\nf 1 2 3\nv 5 5 5 1 0 0\nusemtl a\nf -4 -3 -1"
     geometry = mesh_file.read(write(tmp_path, text), groups=False)
@@ -172,32 +146,12 @@ def test_statements_in_different_blocks_belong_together(tmp_path):
     np.testing.assert_array_equal(geometry.region[geometry.face[:, 0]], [0, 1, 0])
 
 
-def test_many_faces_are_as_many_triangles(tmp_path):
-    rows = 300
-    place = [f"v {x} {y} 0\nvt {x} {y}" for y in range(rows) for x in range(rows)]
-    first = [y * rows + x + 1 for y in range(rows - 1) for x in range(rows - 1)]
-    faces = ["f " + " ".join(f"{i}/{i}" for i in (a, a + 1, a + rows + 1, a + rows)) for a in first]
-    geometry = mesh_file.read(write(tmp_path, "\n".join([*place, *faces])), groups=False)
-    assert geometry.face.shape == (2 * (rows - 1) ** 2, 3)
-    np.testing.assert_array_equal(geometry.position[:, :2], geometry.texture)
-    corner = geometry.position[geometry.face]
-    area = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    np.testing.assert_array_equal(area, np.tile([0, 0, 1], (len(area), 1)))
-
-
 def test_an_empty_material_name_is_that_of_faces_without_a_material(tmp_path):
     text = TRIANGLE + "usemtl \nf 3 2 1\nusemtl.map_off a\nusemtl\nf 1 2 3\n"
     with pytest.warns(UserWarning, match=r"ignored are statements usemtl\.map_off$"):
         (part,) = load_scene(write(tmp_path, text)).parts
     assert part.name == "scene"
     assert len(part.mesh.face) == 3
-
-
-def test_a_comment_that_ends_in_a_backslash_does_not_continue(tmp_path):
-    geometry = mesh_file.read(
-        write(tmp_path, "# C:\\models\\\n" + TRIANGLE.replace("v 0 0 1", "v 0 0 \\\n 1")), groups=False
-    )
-    np.testing.assert_array_equal(geometry.position, POSITION)
 
 
 def write_materials(folder, materials, lines="usemtl a\n" + FACE, name="scene"):
@@ -228,7 +182,7 @@ def test_parts_are_the_materials_in_order_of_their_first_faces(tmp_path):
     np.testing.assert_array_equal(default.base_color, [0.5] * 3)
 
 
-@pytest.mark.parametrize("exponent", [0, 10, 500])
+@pytest.mark.parametrize("exponent", [0, 500])
 def test_phong_becomes_the_microfacets_nearest_to_its_lobe(tmp_path, exponent):
     material = one(tmp_path, f"Kd .5 .5 .5\nKs .2 .1 .04\nNs {exponent}\nNi 1.2\nillum 2\n").material
     # A Beckmann distribution of width m is near a power 2 / m^2 - 2 of the cosine: Walter et al. 2007, section 5.2.
@@ -259,7 +213,7 @@ def exported(folder, header, statements):
     ("header", "exponent"),
     [("# Blender 3.6.0", 1000), ("# Blender 4.2.1 LTS", 1000), ("# Blender v2.93.5 OBJ File: ''", 900)],
 )
-@pytest.mark.parametrize(("roughness", "specular", "metallic"), [(0.5, 0.5, 0), (0, 0.25, 1), (1, 1, 0.7), (0.3, 0, 0)])
+@pytest.mark.parametrize(("roughness", "specular", "metallic"), [(0.5, 0.5, 0), (1, 1, 0.7), (0.3, 0, 0)])
 def test_materials_that_blender_exports_come_back(tmp_path, header, exponent, roughness, specular, metallic):
     # As obj_export_mtl.cc writes them: the ambient color is the metalness, or 1 for dielectrics.
     illum, ambient = 1 if specular == 0 else 3 if metallic else 2, metallic or 1
@@ -327,19 +281,6 @@ def test_libraries_and_images_are_read_once_and_only_those_of_used_materials(tmp
     np.testing.assert_allclose(first.base_color_texture.image, IMAGE, atol=1e-6)
 
 
-def test_damaged_images_are_decoded_once_and_named_once(tmp_path, monkeypatch):
-    (tmp_path / "text.png").write_text("no picture")
-    decoded, decode = [], images.decode_image
-    monkeypatch.setattr(
-        images, "decode_image", lambda *args, **how: decoded.append(how["name"]) or decode(*args, **how)
-    )
-    materials = "newmtl a\nmap_Kd text.png\nnewmtl b\nmap_Kd text.png\n"
-    path = write_materials(tmp_path, materials, f"usemtl a\n{FACE}usemtl b\n{FACE}")
-    with pytest.warns(UserWarning, match=r"ignored are map_Kd \(.*text\.png must be an EXR[^(]*\)$"):
-        assert len(load_scene(path).parts) == 2
-    assert len(decoded) == 1
-
-
 @pytest.mark.parametrize(
     ("statement", "alpha"),
     [("d 0.5", 0.5), ("d -halo 1.0", None), ("d 1 # -halo", None), ("Tr .25", 0.75), ("d .5\nTr .5", 0.5)],
@@ -361,11 +302,6 @@ def test_names_of_materials_and_images_are_read_as_they_stand(tmp_path, name):
     assert float(np.max(part.material.base_color_texture.image)) < 0.9
 
 
-def test_a_map_without_a_file_is_named(tmp_path):
-    with pytest.warns(UserWarning, match="ignored are Ks beside Pr and Pm, map_Kd without a file$"):
-        one(tmp_path, "Pr .3\nKs .9 .1 .1\nmap_Kd\n")
-
-
 def test_map_d_is_the_alpha_of_an_image_or_else_its_gray(tmp_path):
     write_png(tmp_path / "alpha.png", np.array([[[0.1, 0.1, 0.1, 0.2]]]))
     write_png(tmp_path / "gray.png", np.array([[[0.2, 0.1, 0.1]]]))
@@ -385,17 +321,14 @@ REFRACTED = r"illum {} \(glass: nothing is refracted, and only d, Tr and map_d l
 @pytest.mark.parametrize(
     ("statements", "words"),
     [
-        *((f"Kd 0 0 0\nTf 1 1 1\nNi 1.5\nillum {model}", REFRACTED.format(model)) for model in (4, 6, 7, 9)),
-        ("d .5\nillum 9", REFRACTED.format(9)),
-        ("illum 10", "illum 10"),
+        *((f"Kd 0 0 0\nTf 1 1 1\nNi 1.5\nillum {model}", REFRACTED.format(model)) for model in (4, 9)),
         ("d .5\nTf 1 0 0", r"Tf 1 0 0 \(the color of light that passes through\)"),
         ("d 0", r"faces of material 'a' \(they are invisible: its opacity is 0\)"),
-        ("Tr 1", r"faces of material 'a' \(they are invisible: its opacity is 0\)"),
         ("map_d black.png", r"faces of material 'a' \(they are invisible: its opacity is 0\)"),
-        ("d -halo .5", "-halo of d"),
         ("Kd 1 0 0\nKd 0 1 0", "all but the last Kd of material 'a'"),
         ("Kd 1 0 0\nnewmtl a\nKd 0 1 0", "all but the last newmtl a"),
         ("aniso .5\nanisor .2", "aniso"),
+        ("Pr .3\nKs .9 .1 .1\nmap_Kd", "Ks beside Pr and Pm, map_Kd without a file"),
         ("Ps .4\nPc 1", r"Ps beside Pc \(sheens under clear coats\)"),
         ("Pr .5\nNi .5", "Ni below 1"),
         ("map_Ks black.png\ndisp black.png\nrefl -type sphere black.png", "disp, map_Ks, refl"),
@@ -491,16 +424,6 @@ def test_files_of_faces_without_area_are_refused(tmp_path, text):
     assert len(load_mesh(write(tmp_path, text + "v 1 0 9\nv 5 5 5\nf 1 1 2\nf 1 4 5\n")).face) == 2
 
 
-def test_maps_that_move_without_end_are_refused_by_name(tmp_path):
-    write_png(tmp_path / "a.png", IMAGE)
-    for options in ("-s 1e300 1 1", "-o 0 -1e300"):
-        message = "scene.mtl, map_Kd of material 'a': the texture's transform must be finite"
-        with pytest.raises(ValueError, match=message):
-            one(tmp_path, f"map_Kd {options} a.png\n")
-    with pytest.raises(ValueError, match=r"scene\.mtl, material 'a': normal_scale"):
-        one(tmp_path, "norm -bm 1e300 a.png\n")
-
-
 def test_comments_end_names_only_where_their_sign_stands_alone(tmp_path):
     write_png(tmp_path / "c#1.png", IMAGE)
     materials = "newmtl M_#1 # first\nKd 1 0 0 # red\nmap_Kd c#1.png # four colors\nnewmtl M_#2 #\nKd 0 1 0#green\n"
@@ -539,22 +462,22 @@ def test_what_is_missing_or_not_honored_is_said_once_by_name(tmp_path):
         ("Kd 1 x 1", "material 'a': Kd must have finite numbers, got 'Kd 1 x 1'"),
         ("Ns nan", "material 'a': Ns must have finite numbers, got 'Ns nan'"),
         ("Kd", "material 'a': Kd must have finite numbers, got 'Kd'"),
-        *(
-            (
-                f"Kd {words}",
-                rf"material 'a': Kd must have finite numbers, got 'Kd {words}' \(1 or 3 of linear RGB; spec",
-            )
-            for words in ("spectral a.rfl", "xyz 1 1 1", ".5 .5")
+        (
+            "Kd spectral a.rfl",
+            r"material 'a': Kd must have finite numbers, got 'Kd spectral a.rfl' \(1 or 3 of linear RGB; spec",
         ),
         ("Pr -1", "material 'a': roughness of TexturedMaterial must be between 0 and 1"),
+        ("map_Kd -s 1e300 1 1 a.png", "map_Kd of material 'a': the texture's transform must be finite"),
+        ("norm -bm 1e300 a.png", "material 'a': normal_scale"),
     ],
 )
 def test_damaged_numbers_are_refused_by_name(tmp_path, statement, message):
+    write_png(tmp_path / "a.png", IMAGE)
     with pytest.raises(ValueError, match=f"scene.mtl, {message}"):
         one(tmp_path, statement)
 
 
-@pytest.mark.parametrize("name", ["fuze", "rabbit", "chair_model", "negative_indices"])
+@pytest.mark.parametrize("name", ["fuze", "chair_model"])
 def test_real_files_have_the_regions_of_their_meshes_and_say_what_is_missing(data, name):
     path = data / f"meshes_awkward/{name}.obj"
     with warnings.catch_warnings(record=True) as caught:
