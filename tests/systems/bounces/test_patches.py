@@ -149,6 +149,16 @@ def test_faces_twice_in_opposite_orientation_reflect_as_their_fronts():
     np.testing.assert_allclose(both[COUNT:][INSIDE], 0, atol=1e-5)
 
 
+def test_backs_of_surfaces_send_no_light():
+    """A lid over the bowl that faces up: the bowl sees its back."""
+    lid = builtin.plane(cells=14)
+    above = make_mesh(np.asarray(lid.position) + np.float32([0, 0.2, 0]), lid.face, normal=lid.normal)
+    traced = bounces.patches.exchange(join([bowl(), above]), patches=64, size=16, edge=2)
+    own, back = (traced.factor[:COUNT, traced.region == region] for region in (0, 1))
+    assert own.max() > 0.01
+    np.testing.assert_array_equal(back, np.zeros((COUNT, np.sum(traced.region == 1))))
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_numbers_of_patches_and_bounces_that_are_none_are_refused():
     for options, message in (
