@@ -31,10 +31,6 @@ def test_smaller_clusters_repeat_their_last_point(random):
         assert row[0] != row[1]
 
 
-def test_one_cluster_holds_all_points_in_their_order(random):
-    np.testing.assert_array_equal(bisect(random.normal(size=(9, 3)), clusters=1), [np.arange(9)])
-
-
 def test_blobs_far_apart_are_told_apart(random):
     corner = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [100, 10, 1]
     blob = random.permutation(np.repeat(np.arange(8), 12))
@@ -64,28 +60,6 @@ def test_clusters_do_not_depend_on_place_size_direction_or_order_of_the_points(r
         assert partition(bisect(moved, clusters=8)) == expected
     order = random.permutation(48)
     assert partition(order[bisect(point[order], clusters=8)]) == expected
-
-
-def _spread(point, clusters):
-    return [np.sum((point[list(each)] - point[list(each)].mean(0)) ** 2) for each in clusters]
-
-
-def test_clusters_are_tighter_than_random_ones(random):
-    point = random.normal(size=(300, 3))
-    found = sum(_spread(point, partition(bisect(point, clusters=20))))
-    any_ = sum(_spread(point, partition(random.permutation(300).reshape(20, 15))))
-    # Cells of a uniform grid of 20 in a normal cloud have .2 of its variance, random sets nearly all.
-    assert found < 0.3 * any_
-
-
-def test_points_that_coincide_are_still_shared_out_evenly():
-    member = bisect(np.ones((10, 3)), clusters=4)
-    np.testing.assert_array_equal(np.sort(np.concatenate([np.unique(row) for row in member])), np.arange(10))
-
-
-def test_float32_points_are_taken():
-    member = bisect(np.array([[0.0], [5], [1], [6]], np.float32), clusters=2)
-    assert partition(member) == {frozenset({0, 2}), frozenset({1, 3})}
 
 
 @pytest.mark.parametrize("clusters", [0, -1, 6])

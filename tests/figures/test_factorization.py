@@ -13,8 +13,7 @@ from benchmarks.published.factorization import (
     red_plastic,
     sample_error,
 )
-from jaxprt.brdf import AshikhminShirley, Lafortune, Lambert
-from jaxprt.decompose import eigen
+from jaxprt.brdf import AshikhminShirley, Lafortune
 from jaxprt.sphere import hemisphere
 
 WANG = AshikhminShirley(diffuse=0.5, specular=0.75, nu=10, nv=100)
@@ -87,20 +86,6 @@ def test_published_spectrum_of_the_published_brdf():
     assert factored.error == pytest.approx(0.64, abs=0.006)
 
 
-def test_the_printed_iteration_gives_a_worse_but_finite_factorization_and_states_its_error():
-    best, printed = (
-        factor_symmetric(WANG, terms=8, resolution=16, solve=solve) for solve in (eigen.symmetric, eigen.power)
-    )
-    assert best.error < printed.error < 1
-    assert jnp.max(jnp.abs(printed.light_map)) < 2 * jnp.max(jnp.abs(best.light_map))
-    matrix = _weighted("disk", 16, WANG)
-    direction, area = _texels("disk", 16)
-    found = np.asarray(evaluate(printed, *_pairs(direction)), np.float64).reshape(matrix.shape) * np.sqrt(
-        area * area[:, None]
-    )
-    assert np.linalg.norm(found - matrix) / np.linalg.norm(matrix) == pytest.approx(float(printed.error), rel=1e-3)
-
-
 def test_lafortune_and_plastics_are_reciprocal_and_factored_per_color():
     # Clay's first two lobes as published, of which the first sends light past the mirror direction at grazing angles.
     clay = Lafortune(
@@ -113,9 +98,10 @@ def test_lafortune_and_plastics_are_reciprocal_and_factored_per_color():
     for brdf in (clay, red_plastic(), brown_plastic()):
         factored = factor_symmetric(brdf, terms=8, resolution=16)
         assert factored.light_map.shape == (8, 16, 16, 3)
-        assert jnp.all(jnp.isfinite(factored.light_map))
-        one = factor_symmetric(brdf, terms=1, resolution=16)
-        assert factored.error < one.error < 1
+        assert np.isfinite(factored.light_map).all()
+        error, fewer = (sample_error(brdf, each)[1] for each in (factored, factored.truncate(1)))
+        assert factored.error < 1
+        assert error < fewer < 1
 
 
 @each_map
@@ -148,33 +134,17 @@ def test_normalized_term_has_the_reflectance_of_every_view(name):
     np.testing.assert_allclose(found, expected, rtol=1e-4)
 
 
-def test_normalized_term_is_near_the_best_single_term():
-    single = factor_symmetric(WANG, terms=1, resolution=16)
-    factored = factor_normalized(WANG, resolution=16)
-    assert single.error < factored.error < 1.05 * single.error
-
-
-def test_black_brdf_gives_zero_without_nan():
-    for factored in (
-        factor_symmetric(Lambert(0.0), terms=2, resolution=8),
-        factor_normalized(Lambert(0.0), resolution=8),
-    ):
-        assert factored.error == 0
-        assert jnp.all(factored.light_map == 0)
-        assert jnp.all(factored.view_map == 0)
-
-
 def test_polar_maps_are_read_across_the_seam_and_after_pickling():
     coordinates = hemisphere.polar_coordinates
     factored = factor_symmetric(WANG, terms=8, resolution=16, coordinates=coordinates)
     again = pickle.loads(pickle.dumps(factored))
     assert again.coordinates is coordinates
     # The seam is where x = 0 and y > 0.
-    seam = jnp.array([[x, 0.6, 0.8] for x in (-1e-4, 0.0, 1e-4)])
-    view = jnp.broadcast_to(jnp.array([0.0, -0.6, 0.8]), seam.shape)
-    value = again(seam, view)
-    np.testing.assert_allclose(value, value[1] * jnp.ones((3, 1)), rtol=1e-2)
-    np.testing.assert_array_equal(value, factored(seam, view))
+    seam = np.float32([[x, 0.6, 0.8] for x in (-1e-4, 0.0, 1e-4)])
+    view = np.tile(np.float32([0.0, -0.6, 0.8]), (3, 1))
+    value = np.asarray(evaluate(again, seam, view))
+    np.testing.assert_allclose(value, value[1] * np.ones((3, 1)), rtol=1e-2)
+    np.testing.assert_array_equal(value, evaluate(factored, seam, view))
 
 
 @pytest.mark.parametrize(
@@ -198,13 +168,6 @@ def test_more_terms_than_texels_and_other_than_reciprocal_brdfs_are_refused():
         factor_symmetric(WANG, terms=53, resolution=8)
     with pytest.raises(ValueError, match="must be reciprocal"):
         factor_symmetric(lambda wi, wo: wi[..., 2:] + 0 * wo[..., 2:], terms=1, resolution=8)
-
-
-def test_sample_error_falls_with_the_terms_of_a_smooth_brdf():
-    brdf = brown_plastic()
-    factored = factor_symmetric(brdf, terms=8, resolution=16)
-    errors = [float(sample_error(brdf, each)[1]) for each in (factored, factored.truncate(1))]
-    assert errors[0] < errors[1] < 1
 
 
 def _constant(value):

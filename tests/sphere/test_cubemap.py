@@ -7,7 +7,7 @@ import pytest
 
 from jaxprt.sphere import cubemap
 
-SIZES = [1, 2, 3, 8, 64]
+SIZES = [1, 2, 5]
 
 
 def random_cubemap(size, *channels, seed=0):
@@ -31,18 +31,14 @@ def opengl_coordinates(direction):
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_solid_angles_sum_to_the_sphere(size):
-    total = np.asarray(cubemap.solid_angle(size=size), np.float64).sum()
-    assert total == pytest.approx(4 * np.pi, rel=1e-6)
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_directions_are_unit_and_points_lie_on_the_cube(size):
+def test_directions_are_unit_points_lie_on_the_cube_and_solid_angles_sum_to_the_sphere(size):
     direction = cubemap.direction(size=size)
     np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1, rtol=1e-6)
     point = np.asarray(cubemap.point(size=size))
     assert (np.abs(point).max(-1) == 1).all()
     np.testing.assert_allclose(point / np.linalg.norm(point, axis=-1, keepdims=True), direction, atol=1e-6)
+    total = np.asarray(cubemap.solid_angle(size=size), np.float64).sum()
+    assert total == pytest.approx(4 * np.pi, rel=1e-6)
 
 
 def test_faces_rows_and_columns_are_those_of_opengl():
@@ -58,7 +54,7 @@ def test_faces_rows_and_columns_are_those_of_opengl():
     np.testing.assert_allclose(place[..., 1], np.broadcast_to(center[:, None], (6, size, size)), atol=1e-6)
 
 
-@pytest.mark.parametrize("size", [1, 2, 5])
+@pytest.mark.parametrize("size", SIZES)
 def test_solid_angle_and_vector_area_equal_fine_quadrature(size):
     fine = 120
     direction = np.asarray(cubemap.direction(size=size * fine), np.float64)
@@ -70,15 +66,6 @@ def test_solid_angle_and_vector_area_equal_fine_quadrature(size):
     np.testing.assert_allclose(cubemap.solid_angle(size=size), weight.reshape(block).sum((2, 4))[..., 0], rtol=1e-5)
 
 
-@pytest.mark.parametrize("size", [2, 8, 64])
-def test_vector_area_integrates_the_cosine_over_a_hemisphere_to_pi(size):
-    area = np.asarray(cubemap.vector_area(size=size), np.float64)
-    direction = cubemap.direction(size=size)
-    for axis, sign in itertools.product(range(3), (1, -1)):
-        above = sign * direction[..., axis] > 0
-        assert sign * area[above][:, axis].sum() == pytest.approx(np.pi, rel=1e-6)
-
-
 @pytest.mark.parametrize("size", SIZES)
 def test_lookup_at_texel_centers_returns_the_texels(size):
     texel = random_cubemap(size, 3)
@@ -86,14 +73,14 @@ def test_lookup_at_texel_centers_returns_the_texels(size):
 
 
 @pytest.mark.parametrize("sharpness", [1, 3])
-@pytest.mark.parametrize("size", [1, 2, 64])
+@pytest.mark.parametrize("size", [1, 5])
 def test_lookup_reproduces_constants_exactly(size, sharpness):
     constant = np.float32(0.1)
-    value = cubemap.lookup(jnp.full((6, size, size), constant), random_direction(10000), sharpness=sharpness)
+    value = cubemap.lookup(jnp.full((6, size, size), constant), random_direction(2000), sharpness=sharpness)
     assert (np.asarray(value) == constant).all()
 
 
-@pytest.mark.parametrize("size", [1, 2, 7])
+@pytest.mark.parametrize("size", [1, 5])
 def test_lookup_is_continuous_over_edges_and_corners(size):
     texel = random_cubemap(size)
     along = np.linspace(-1, 1, 201)
@@ -114,7 +101,7 @@ def test_lookup_converges_to_a_smooth_function():
     def smooth(s):
         return 1 + s[..., 0] * s[..., 1] + s[..., 2] ** 3 + s[..., 1]
 
-    direction = random_direction(20000)
+    direction = random_direction(2000)
     error = [
         np.asarray(cubemap.lookup(smooth(cubemap.direction(size=n)), direction) - smooth(direction)) for n in (8, 32)
     ]
@@ -124,47 +111,26 @@ def test_lookup_converges_to_a_smooth_function():
     assert np.median(np.abs(error[1])) < np.median(np.abs(error[0])) / 12
 
 
-def test_lookup_does_not_depend_on_the_length_of_the_direction():
-    texel, direction = random_cubemap(8, 2), random_direction(1000)
-    np.testing.assert_allclose(
-        cubemap.lookup(texel, 8 * direction), cubemap.lookup(texel, direction), rtol=1e-6, atol=1e-7
-    )
-
-
-def test_lookup_stays_within_the_range_of_the_texels():
-    texel = random_cubemap(4) * 1e4
-    value = cubemap.lookup(texel, random_direction(20000))
-    assert texel.min() * (1 - 1e-6) <= value.min()
-    assert value.max() <= texel.max() * (1 + 1e-6)
-
-
 def test_sharpness_narrows_the_transition_to_that_fraction_of_a_texel():
     texel = jnp.zeros((6, 4, 4)).at[4, :, 2:].set(1)  # A step at s = 0 on face +z.
     s = np.linspace(-0.5, 0.5, 101)
     direction = np.stack([s, 0 * s + 0.1, 0 * s + 1], -1).astype(np.float32)
-    for sharpness in (1, 2, 5):
+    for sharpness in (1, 3):
         expected = np.clip(s * 2 * sharpness + 0.5, 0, 1)
         np.testing.assert_allclose(
             cubemap.lookup(texel, direction, sharpness=sharpness), expected, atol=1e-5 * sharpness
         )
 
 
-def test_lookup_batches_over_directions_and_channels():
-    texel, direction = random_cubemap(4, 2, 3), random_direction(12).reshape(3, 4, 3)
-    assert cubemap.lookup(texel, direction).shape == (3, 4, 2, 3)
-    assert cubemap.lookup(texel[..., 0, 0], direction).shape == (3, 4)
-    assert cubemap.lookup(texel, direction[0, 0]).shape == (2, 3)
-
-
 def test_gradients_are_finite_everywhere_even_at_corners_and_zero():
     corner = np.array(list(itertools.product((-1, 0, 1), repeat=3)), np.float32)  # Corners, edges, axes and zero.
     direction = np.concatenate([corner, random_direction(100)])
-    gradient = jax.grad(lambda m, d: cubemap.lookup(m, d, sharpness=2).sum(), argnums=(0, 1))
+    gradient = jax.grad(lambda m, d: cubemap.lookup(m, d, sharpness=3).sum(), argnums=(0, 1))
     for part in gradient(random_cubemap(4), direction):
         assert np.isfinite(part).all()
 
 
-@pytest.mark.parametrize("size", [1, 2, 3, 8])
+@pytest.mark.parametrize("size", SIZES)
 def test_border_holds_the_texels_across_the_edges(size):
     index = cubemap.border_index(size=size)
     assert index.dtype == np.int32

@@ -10,7 +10,7 @@ def _image(*shape):
     return np.random.default_rng(0).standard_normal(shape).astype(np.float32)
 
 
-@pytest.mark.parametrize("n", [1, 2, 8, 64])
+@pytest.mark.parametrize("n", [1, 2, 8])
 def test_forward_equals_pywavelets(n):
     image = _image(n, n, 1)
     if n == 1:
@@ -34,10 +34,9 @@ def test_edge_that_is_no_power_of_two_is_refused(n):
 
 def test_area_is_the_support_of_each_basis_function():
     size = 8
-    for row in range(size):
-        for column in range(size):
-            function = haar.inverse(jnp.zeros((size, size, 1)).at[row, column].set(1))
-            assert jnp.mean(function != 0) == haar.area(size=size)[row, column]
+    function = haar.inverse(np.eye(size**2, dtype=np.float32).reshape(-1, size, size, 1))
+    support = np.mean(np.asarray(function) != 0, (1, 2, 3)).reshape(size, size)
+    np.testing.assert_array_equal(support, haar.area(size=size))
 
 
 def test_face_edge_inverts_the_count_and_refuses_others():

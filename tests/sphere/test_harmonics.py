@@ -1,13 +1,15 @@
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from scipy.special import eval_legendre, sph_harm_y
+from scipy.special import eval_legendre
 
-from jaxprt.sphere import cubemap, harmonics
+from jaxprt.sphere import harmonics
+from tests.sphere.basis import band, scipy_basis
 
 DEGREE = 50
 POLES = np.array([[0.0, 0, 1], [0, 0, -1]])
@@ -20,20 +22,6 @@ def unit(seed, count, dtype=np.float64):
 
 def normal(seed, *shape, dtype=np.float64):
     return jnp.asarray(np.random.default_rng(seed).normal(size=shape), dtype)
-
-
-def band(degree):
-    return np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
-
-
-def scipy_basis(direction, degree):
-    """SciPy's complex harmonics as real ones, and without their Condon-Shortley phase."""
-    x, y, z = np.asarray(direction, np.float64).T
-    l = band(degree)
-    m = np.arange(len(l)) - l * (l + 1)
-    value = sph_harm_y(l, abs(m), np.arctan2(np.hypot(x, y), z)[:, None], np.arctan2(y, x)[:, None])
-    part = np.where(m < 0, value.imag, value.real) * np.where(m == 0, 1, np.sqrt(2))
-    return part * (-1.0) ** abs(m)
 
 
 @functools.lru_cache
@@ -51,7 +39,7 @@ def zonal_factor(kernel, l, low, high):
     return 2 * np.pi * quad(lambda t: kernel(t) * eval_legendre(l, t), low, high, epsabs=1e-13, epsrel=1e-13)[0]
 
 
-@pytest.mark.parametrize("degree", [0, 1, 14, DEGREE])
+@pytest.mark.parametrize("degree", [0, 1, DEGREE])
 def test_the_basis_is_orthonormal_and_scipys_in_real_form_without_its_phase(degree, x64, close):
     direction, weight = quadrature(degree)
     others = np.concatenate([unit(0, 100), POLES, np.eye(3), -np.eye(3)])
@@ -60,22 +48,18 @@ def test_the_basis_is_orthonormal_and_scipys_in_real_form_without_its_phase(degr
     some = np.unique(np.random.default_rng(1).integers(0, (degree + 1) ** 2, 200))
     close((inside[:, some] * weight[:, None]).T @ inside, np.eye((degree + 1) ** 2)[some])
     close(outside, scipy_basis(others, degree))
+    single = others.astype(np.float32)
+    exact = single / np.linalg.norm(single.astype(float), axis=1, keepdims=True)
+    close(harmonics.evaluate(single, degree=degree), scipy_basis(exact, degree))
 
 
-def test_degree_50_evaluates_in_float32(x64, close):
-    direction = jnp.concatenate([unit(1, 200, np.float32), jnp.asarray(POLES, jnp.float32)])
-    exact = np.asarray(direction, np.float64)
-    exact /= np.linalg.norm(exact, axis=1, keepdims=True)
-    close(harmonics.evaluate(direction, degree=DEGREE), scipy_basis(exact, DEGREE))
+def test_the_gradient_at_the_poles_is_that_along_great_circles(x64, close):
+    forward, reverse = (jax.jit(slope(lambda s: harmonics.evaluate(s, degree=8))) for slope in (jax.jacfwd, jax.jacrev))
+    for pole, tangent in itertools.product(POLES, np.eye(3)[:2]):
+        jacobian = np.asarray(forward(pole))
+        close(reverse(pole), jacobian)
 
-
-@pytest.mark.parametrize("pole", POLES)
-def test_the_gradient_at_the_poles_is_that_along_great_circles(pole, x64, close):
-    jacobian = jax.jacfwd(lambda s: harmonics.evaluate(s, degree=8))(jnp.asarray(pole))
-    close(jax.jacrev(lambda s: harmonics.evaluate(s, degree=8))(jnp.asarray(pole)), jacobian)
-    for tangent in np.eye(3)[:2]:
-
-        def along(t, tangent=tangent):
+        def along(t, pole=pole, tangent=tangent):
             return scipy_basis((np.cos(t) * pole + np.sin(t) * tangent)[None], 8)[0]
 
         h = 1e-3
@@ -98,29 +82,12 @@ def test_gradients_of_high_degree_in_float32_are_those_of_finite_differences(x64
     close(gradient, np.stack(expected, -1))
 
 
-def test_the_error_of_projected_harmonics_falls_with_the_square_of_the_texels(x64):
-    error = []
-    for size in (8, 16, 32):
-        basis = harmonics.evaluate(jnp.asarray(np.asarray(cubemap.direction(size=size), np.float64)), degree=3)
-        error.append(np.linalg.norm(harmonics.project(basis, degree=3) - np.eye(16)))
-    ratio = np.array(error[:-1]) / error[1:]
-    assert (ratio > 3.5).all()
-    assert (ratio < 4.5).all()
-
-
-@pytest.mark.parametrize(("size", "degree"), [(1, 12), (5, 12), (16, 0)])
+@pytest.mark.parametrize(("size", "degree"), [(1, 9), (5, 9), (16, 0)])
 def test_constant_light_has_one_coefficient_only(size, degree, x64, close):
     expected = np.zeros(((degree + 1) ** 2, 2))
     expected[0] = np.sqrt(4 * np.pi) * np.array([1, 3])
     radiance = jnp.broadcast_to(jnp.array([1.0, 3.0]), (6, size, size, 2))
     close(harmonics.project(radiance, degree=degree), expected)
-
-
-@pytest.mark.parametrize("size", [1, 4, 5])
-def test_projection_is_of_the_piecewise_constant_function(size, x64, close):
-    radiance = normal(5, 6, size, size, 2)
-    fine = jnp.repeat(jnp.repeat(radiance, 3, 1), 3, 2)
-    close(harmonics.project(fine, degree=10), harmonics.project(radiance, degree=10))
 
 
 def test_one_texel_projects_to_the_integral_of_scipys_basis_over_it(x64, close):
@@ -133,12 +100,6 @@ def test_one_texel_projects_to_the_integral_of_scipys_basis_over_it(x64, close):
     solid_angle = np.outer(weight, weight).ravel() / size**2 / length**3
     radiance = jnp.zeros((6, size, size)).at[face, row, column].set(2)
     close(harmonics.project(radiance, degree=9), 2 * solid_angle @ scipy_basis(place / length[:, None], 9))
-
-
-def test_the_mean_of_any_cubemap_is_weighted_by_its_solid_angles(x64, close):
-    radiance = normal(6, 6, 7, 7)
-    expected = np.sum(np.asarray(radiance) * np.asarray(cubemap.solid_angle(size=7))) / np.sqrt(4 * np.pi)
-    close(harmonics.project(radiance, degree=2)[0], expected)
 
 
 def test_reconstruction_sums_coefficients_times_the_basis(x64, close):
@@ -156,12 +117,11 @@ def test_the_clamped_cosine_has_the_factors_of_its_integral(x64, close):
     close(harmonics.cosine(degree=1), np.array(expected[:2]))
 
 
-@pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 7.0, 33.3, 200.0])
+@pytest.mark.parametrize("exponent", [0.0, 1.0, 33.3, 200.0])
 def test_phong_lobes_have_the_factors_of_their_integral(exponent, x64, close):
     scale = (exponent + 1) / (2 * np.pi)
     expected = [zonal_factor(lambda t: scale * t**exponent, l, 0, 1) for l in range(15)]
     close(harmonics.phong(jnp.array(exponent), degree=14), np.array(expected))
-    close(harmonics.phong(jnp.array(exponent), degree=0), np.ones(1))
 
 
 def test_a_convolved_light_is_the_integral_of_the_light_over_the_kernel(x64, close):
@@ -181,7 +141,8 @@ def _basis(direction, degree):
     return scipy_basis(direction.reshape(-1, 3), degree).reshape(*direction.shape[:-1], -1)
 
 
-ANGLE = [1e-4, 4.7e-3, 0.1, 0.7, np.pi / 2, 2.5, np.pi - 1e-3, np.pi]
+disc_slope = jax.jit(jax.jacfwd(lambda direction, angle: harmonics.disc(direction, angle, degree=14), 1))
+ANGLE = [1e-4, 4.7e-3, 0.7, np.pi / 2, np.pi - 1e-3, np.pi]
 
 
 def disc_factors(angle, degree):
@@ -204,15 +165,14 @@ def test_discs_of_any_size_are_their_quadrature(angle, dtype, x64, close):
 
 @pytest.mark.parametrize("angle", [0.0, *ANGLE])
 def test_the_change_of_a_disc_with_its_angle_is_its_rim(angle, x64, close):
-    direction = unit(13, 1)[0]
-    actual = jax.jacfwd(lambda a: harmonics.disc(direction, a, degree=14))(jnp.array(angle))
+    direction = unit(12, 5)[0]
+    actual = disc_slope(direction, jnp.array(angle))
     rim = 2 * np.pi * np.sin(angle) * eval_legendre(np.arange(15), np.cos(angle))
     expected = scipy_basis(direction[None], 14)[0] * rim[band(14)]
     if angle == np.pi:
         assert np.abs(np.asarray(actual)).max() < 1e-12
     else:
         close(actual, expected)
-    close(jax.jacrev(lambda a: harmonics.disc(direction, a, degree=14))(jnp.array(angle)), actual)
 
 
 def test_hann_and_lanczos_are_their_values_of_the_band_over_the_first_left_out(x64, close):
@@ -226,8 +186,8 @@ def laplacian(coefficient):
     return float(np.sum((l * (l + 1))[:, None] ** 2 * np.asarray(coefficient) ** 2))
 
 
-@pytest.mark.parametrize("kept", [1.0, 0.9, 0.1, 1e-3, 1e-6])
-@pytest.mark.parametrize("degree", [1, 14, DEGREE])
+@pytest.mark.parametrize("kept", [1.0, 0.1, 1e-6])
+@pytest.mark.parametrize("degree", [1, DEGREE])
 def test_the_window_of_least_laplacian_leaves_the_share_that_was_asked_for(kept, degree, x64, close):
     coefficient = normal(15, (degree + 1) ** 2, 3)
     factor = harmonics.least_laplacian(coefficient, jnp.array(kept))
@@ -235,16 +195,13 @@ def test_the_window_of_least_laplacian_leaves_the_share_that_was_asked_for(kept,
     assert factor[0] == 1
     left = laplacian(harmonics.convolve(coefficient, factor)) / laplacian(coefficient)
     close(np.array(left), np.array(kept), tolerance=1e-9)
-
-
-def test_no_other_window_of_its_laplacian_changes_the_function_less(x64):
-    coefficient = normal(16, 81, 3)
-    for window in (harmonics.hann(degree=8), harmonics.lanczos(degree=8)):
-        other = harmonics.convolve(coefficient, window)
-        kept = laplacian(other) / laplacian(coefficient)
-        least = harmonics.convolve(coefficient, harmonics.least_laplacian(coefficient, jnp.array(kept)))
-        assert laplacian(least) == pytest.approx(laplacian(other), rel=1e-9)
-        assert np.linalg.norm(least - coefficient) < 0.999 * np.linalg.norm(other - coefficient)
+    if degree > 1 and kept == 0.1:  # No other window of its Laplacian changes the function less.
+        for window in (harmonics.hann(degree=degree), harmonics.lanczos(degree=degree)):
+            other = harmonics.convolve(coefficient, window)
+            share = jnp.array(laplacian(other) / laplacian(coefficient))
+            least = harmonics.convolve(coefficient, harmonics.least_laplacian(coefficient, share))
+            assert laplacian(least) == pytest.approx(laplacian(other), rel=1e-9)
+            assert np.linalg.norm(least - coefficient) < 0.999 * np.linalg.norm(other - coefficient)
 
 
 def test_a_share_of_zero_keeps_the_mean_alone_and_shares_out_of_range_are_refused(x64):
@@ -255,36 +212,12 @@ def test_a_share_of_zero_keeps_the_mean_alone_and_shares_out_of_range_are_refuse
             harmonics.least_laplacian(normal(17, 25, 3), jnp.array(kept))
 
 
-def test_whole_numbers_are_projected_and_evaluated_as_the_floating_point_numbers_that_they_are(close):
-    whole = np.random.default_rng(18).integers(0, 9, size=(6, 4, 4, 2))
-    expected = harmonics.project(jnp.asarray(whole, jnp.float32), degree=3)
-    close(harmonics.project(jnp.asarray(whole), degree=3), expected)
-    axis = jnp.array([[0, 0, 1], [0, -1, 0]])
-    close(harmonics.evaluate(axis, degree=3), harmonics.evaluate(axis.astype(float), degree=3))
-
-
 def test_where_there_is_no_laplacian_the_window_is_one_and_gradients_are_finite(x64):
     for coefficient in (jnp.zeros((25, 3)), jnp.zeros((25, 3)).at[0].set(2.0)):
         factor = harmonics.least_laplacian(coefficient, jnp.array(0.5))
         np.testing.assert_array_equal(factor, 1)
         gradient = jax.grad(lambda c: jnp.sum(harmonics.least_laplacian(c, jnp.array(0.5))))(coefficient)
         assert np.isfinite(gradient).all()
-
-
-@pytest.mark.parametrize("degree", [4, 8])
-def test_every_window_reduces_the_ringing_of_a_sun_of_one_texel(degree):
-    sun = harmonics.project(jnp.zeros((6, 32, 32)).at[2, 11, 20].set(1e4), degree=degree)
-    direction = cubemap.direction(size=24)
-
-    def most_negative(factor):
-        value = harmonics.reconstruct(harmonics.convolve(sun, factor), direction)
-        return float(-value.min() / value.max())
-
-    plain = most_negative(jnp.ones(degree + 1))
-    assert plain > 0.1
-    least = harmonics.least_laplacian(sun, jnp.array(0.05))
-    for factor in (harmonics.hann(degree=degree), harmonics.lanczos(degree=degree), least):
-        assert most_negative(factor) < 0.6 * plain
 
 
 def test_wrong_numbers_are_refused_by_what_was_required_and_what_came(unchecked):

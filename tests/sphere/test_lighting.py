@@ -67,12 +67,11 @@ def test_irradiance_of_an_environment_approaches_the_sum_over_texels():
     exact = summed(light, normal)
     error = [
         np.linalg.norm(np.asarray(irradiance(light, normal, degree=degree)) - exact) / np.linalg.norm(exact)
-        for degree in (0, 1, 2, 4, 8, 16)
+        for degree in (0, 1, 2, 4, 16)
     ]
     assert np.all(np.diff(error) < 0)
     assert error[2] < 0.02
     assert error[-1] < 1.5e-3  # White noise has much in its high bands.
-    assert irradiance(light, normal.reshape(5, 8, 3)).shape == (5, 8, 3)
     white = irradiance(Environment(jnp.ones((6, 4, 4, 1))), [0.0, 1.0, 0.0])
     np.testing.assert_allclose(white, [np.pi], rtol=1e-5)
 
@@ -102,8 +101,8 @@ def test_lights_that_are_no_lights_are_refused():
         irradiance(Environment(jnp.ones((2, 6, 4, 4, 3))), [0.0, 0, 1])
 
 
-@pytest.mark.parametrize("degree", [1, 2, 4])
-def test_a_directional_light_is_found_again(degree, x64, close):
+@pytest.mark.parametrize("degree", [1, 4])
+def test_a_directional_light_is_found_again_and_of_others_the_least_squares(degree, x64, close):
     way, color = unit(1)[0], np.array([3.0, 2.0, 0.5])
     sharp = np.asarray(harmonics.evaluate(jnp.asarray(way), degree=degree))[:, None] * color
     direction, found = low_frequency.directional_light(jnp.asarray(sharp))
@@ -114,16 +113,13 @@ def test_a_directional_light_is_found_again(degree, x64, close):
     close(direction, way)
     close(found, color)
     close(ambient, np.full(3, 0.7))
-
-
-def test_colors_are_those_of_least_squares(x64, close):
-    light = RNG.normal(size=(16, 3)) + 2 * (np.arange(16) == 0)[:, None]
-    direction, color = low_frequency.directional_light(jnp.asarray(light))
-    basis = np.asarray(harmonics.evaluate(direction, degree=3))
-    close(color, np.linalg.lstsq(basis[:, None], light, rcond=None)[0][0])
-    direction, color, ambient = low_frequency.directional_and_ambient(jnp.asarray(light))
-    constant = np.sqrt(4 * np.pi) * (np.arange(16) == 0)
-    close(np.stack([color, ambient]), np.linalg.lstsq(np.stack([basis, constant], 1), light, rcond=None)[0])
+    light = sharp + RNG.normal(size=sharp.shape)
+    direction, found = low_frequency.directional_light(jnp.asarray(light))
+    basis = np.asarray(harmonics.evaluate(direction, degree=degree))
+    close(found, np.linalg.lstsq(basis[:, None], light, rcond=None)[0][0])
+    direction, found, ambient = low_frequency.directional_and_ambient(jnp.asarray(light))
+    constant = np.sqrt(4 * np.pi) * (np.arange(len(light)) == 0)
+    close(np.stack([found, ambient]), np.linalg.lstsq(np.stack([basis, constant], 1), light, rcond=None)[0])
 
 
 def test_sloans_normalization_of_nine_coefficients(x64, close):

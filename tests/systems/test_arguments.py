@@ -102,6 +102,7 @@ BROKEN = jnp.ones((9, 3)).at[4, 1].set(jnp.nan)
         (lambda: harmonic.probe_light(POINT, POINT * jnp.nan, jnp.ones((2, 9, 3))), "probes must be finite"),
         (lambda: harmonic.probe_light(POINT, POINT, BROKEN[None]), "the light at the probes must be finite"),
         (lambda: harmonic.probe_light(POINT, POINT[:0], jnp.ones((0, 9, 3))), "there must be at least one probe"),
+        (lambda: harmonic.probe_light(POINT, POINT, jnp.ones((3, 9, 3))), "each of the 2 probes, got light at 3"),
         (
             lambda: harmonic.system.combine(COEFFICIENT[:, 0], VECTOR.vector),
             r"\[lm, c\] or \[lm, c, v\], .* shape \[9\]",
@@ -115,19 +116,6 @@ def test_harmonics_refuse_what_is_not_finite_or_has_other_axes(refused, message)
         refused()
 
 
-@pytest.mark.usefixtures("unchecked")
-def test_light_at_another_number_of_probes_is_refused():
-    with pytest.raises(ValueError, match="light at each of the 2 probes, got light at 3"):
-        harmonic.probe_light(POINT, POINT, jnp.ones((3, 9, 3)))
-
-
 def test_inside_jit_a_light_that_is_not_finite_reaches_the_vertices():
     color = jax.jit(lambda light: prt.radiance(MATTE, light, eye=EYE))(BROKEN)
     np.testing.assert_array_equal(np.isnan(color), [[False, True, False]] * 2)
-
-
-def test_a_batch_of_lights_is_projected_one_by_one(close):
-    light = Environment(jax.random.normal(jax.random.key(0), (2, 3, 6, 8, 8, 3)))
-    together = harmonic.project(light, degree=2)
-    assert together.shape == (2, 3, 9, 3)
-    close(together[1, 2], harmonic.project(Environment(light.radiance[1, 2]), degree=2))

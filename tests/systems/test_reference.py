@@ -32,7 +32,8 @@ def random():
 def mesh():
     """A ball over the ground: 121 vertices, two blocks."""
     ground = prt.scene.builtin.plane(cells=5)
-    ground = eqx.tree_at(lambda m: m.position, ground, 2 * ground.position - jnp.array([0, 1.2, 0]))
+    position = jnp.asarray(2 * np.asarray(ground.position) - np.float32([0, 1.2, 0]))
+    ground = eqx.tree_at(lambda m: m.position, ground, position)
     return prt.scene.mesh.join([prt.scene.builtin.sphere(rings=8, sectors=12), ground])
 
 
@@ -47,12 +48,12 @@ def evaluate(brdf, wi, wo):
 
 def hemisphere(random, count=4):
     """Visibility, positions, frames."""
-    normal = directions.normalize(jnp.asarray(random.normal(size=(count, 3)), jnp.float32))
+    normal = directions.normalize(random.normal(size=(count, 3)).astype(np.float32))
     seen = jnp.asarray(random.integers(17, size=(count, 6 * SIZE**2)), jnp.uint8)
     return (
         seen,
         jnp.asarray(random.normal(size=(count, 3)), jnp.float32),
-        directions.frame(normal, jnp.zeros((count, 3))),
+        directions.frame(normal, np.zeros((count, 3), np.float32)),
     )
 
 
@@ -62,13 +63,13 @@ def test_white_furnace_leaves_a_convex_white_body_invisible():
     np.testing.assert_allclose(color, 1, atol=HORIZON)
 
 
-def test_integration_equals_a_loop_over_texels_in_float64(random, close):
+def test_integration_equals_the_sum_over_texels_in_float64(random, close):
     seen, position, frame = hemisphere(random)
     light = some_light(random)
     direction = np.asarray(cubemap.direction(size=SIZE), np.float64).reshape(-1, 3)
     area = np.asarray(cubemap.vector_area(size=SIZE), np.float64).reshape(-1, 3)
     table = np.asarray(light.radiance, np.float64).reshape(-1, 3)
-    expected = np.zeros((4, 3))
+    expected = []
     for vertex in range(4):
         axes = np.asarray(frame[vertex], np.float64)
         wo = axes @ np.asarray(EYE - position[vertex], np.float64)
@@ -76,42 +77,29 @@ def test_integration_equals_a_loop_over_texels_in_float64(random, close):
         if wo[2] < 0.01:  # seen as grazing
             wo = np.append(wo[:2] / np.linalg.norm(wo[:2]) * np.sqrt(1 - 1e-4), 0.01)
         wo = np.asarray(wo, np.float32)
-        for texel in range(len(direction)):
-            cosine = max(0, area[texel] @ axes[2]) * float(seen[vertex, texel]) / 16
-            if cosine:
-                expected[vertex] += [0.0, 0.0, 0.0] + cosine * table[texel]
-        # The BRDF of all texels in one call; its own tests judge it.
-        wi = jnp.asarray(direction @ axes.T, jnp.float32)
+        wi = (direction @ axes.T).astype(np.float32)
         value = np.asarray(evaluate(GLOSSY, wi, np.broadcast_to(wo, wi.shape)))
         flux = np.maximum(area @ axes[2], 0) * np.asarray(seen[vertex], np.float64) / 16
-        irradiance = (flux[:, None] * table).sum(0)
-        np.testing.assert_allclose(expected[vertex], irradiance, rtol=1e-12)
-        expected[vertex] = (flux[:, None] * table * value).sum(0)
-    close(reference.integrate(seen, position, frame, GLOSSY, light, EYE, error=CENTERS), expected)
+        expected.append((flux[:, None] * table * value).sum(0))
+    close(reference.integrate(seen, position, frame, GLOSSY, light, EYE, error=CENTERS), np.array(expected))
 
 
 def test_lights_in_a_batch_equal_one_by_one(mesh, random, close):
-    light = some_light(random, 2, 2)
-    vertex = np.arange(0, 121, 3)
+    light = some_light(random, 2, 1)
+    vertex = np.arange(0, 121, 2)
     together = reference.radiance(mesh, GLOSSY, light, eye=EYE, vertex=vertex, error=CENTERS)
-    assert together.shape == (2, 2, len(vertex), 3)
-    for i, j in np.ndindex(2, 2):
-        one = Environment(light.radiance[i, j])
-        close(together[i, j], reference.radiance(mesh, GLOSSY, one, eye=EYE, vertex=vertex, error=CENTERS))
+    assert together.shape == (2, 1, len(vertex), 3)
+    for i in range(2):
+        one = Environment(jnp.asarray(np.asarray(light.radiance)[i, 0]))
+        close(together[i, 0], reference.radiance(mesh, GLOSSY, one, eye=EYE, vertex=vertex, error=CENTERS))
 
 
-@pytest.mark.parametrize("count", [1, 64, 65])
+@pytest.mark.parametrize("count", [1, 65])
 def test_vertices_do_not_depend_on_who_else_is_asked_for(mesh, random, close, count):
     light = some_light(random)
     vertex = random.permutation(121)[:count]
     whole = np.asarray(reference.radiance(mesh, GLOSSY, light, eye=EYE))
     close(reference.radiance(mesh, GLOSSY, light, eye=EYE, vertex=vertex), whole[vertex])
-
-
-def test_eyes_in_odd_places_give_finite_radiance(mesh, random):
-    for eye in (mesh.position[7], [0, 0, 0], [0.3, -0.2, 0.4], [1e15, 1e15, -1e15], mesh.position[7] * (1 + 1e-6)):
-        color = reference.radiance(mesh, GLOSSY, some_light(random), eye=jnp.asarray(eye, jnp.float32))
-        assert np.isfinite(color).all()
 
 
 def test_gray_brdfs_and_gray_lights_give_what_their_colors_would(random, close):
@@ -120,11 +108,12 @@ def test_gray_brdfs_and_gray_lights_give_what_their_colors_would(random, close):
         reference.integrate(*arrays, Lambert(0.5), light, EYE, error=CENTERS),
         reference.integrate(*arrays, Lambert([0.5, 0.5, 0.5]), light, EYE, error=CENTERS),
     )
-    gray = Environment(light.radiance[..., :1])
+    gray = Environment(jnp.asarray(np.asarray(light.radiance)[..., :1]))
+    colored = Environment(jnp.asarray(np.repeat(gray.radiance, 3, -1)))
     assert reference.integrate(*arrays, Lambert(0.5), gray, EYE, error=CENTERS).shape == (4, 1)
     close(
         reference.integrate(*arrays, GLOSSY, gray, EYE, error=CENTERS),
-        reference.integrate(*arrays, GLOSSY, Environment(jnp.repeat(gray.radiance, 3, -1)), EYE, error=CENTERS),
+        reference.integrate(*arrays, GLOSSY, colored, EYE, error=CENTERS),
     )
 
 
@@ -151,12 +140,13 @@ def test_texels_that_matter_less_than_the_error_have_one_ray_where_the_surface_i
 @pytest.mark.parametrize("brdf", [Lambert(0.5), GLOSSY], ids=["lambert", "glossy"])
 def test_a_quarter_turn_of_everything_changes_nothing(mesh, brdf, random, close):
     light = some_light(random)
-    turn = jnp.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
-    fields = (mesh.position, mesh.normal, mesh.tangent)
-    turned = eqx.tree_at(lambda m: (m.position, m.normal, m.tangent), mesh, tuple(each @ turn.T for each in fields))
+    turn = np.float32([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    fields = tuple(jnp.asarray(np.asarray(each) @ turn.T) for each in (mesh.position, mesh.normal, mesh.tangent))
+    turned = eqx.tree_at(lambda m: (m.position, m.normal, m.tangent), mesh, fields)
     vertex = np.arange(0, 121, 2)
+    light_turned, eye = rotate(light, jnp.asarray(turn)), jnp.asarray(turn @ np.asarray(EYE))
     close(
-        reference.radiance(turned, brdf, rotate(light, turn), eye=turn @ EYE, vertex=vertex, error=CENTERS),
+        reference.radiance(turned, brdf, light_turned, eye=eye, vertex=vertex, error=CENTERS),
         reference.radiance(mesh, brdf, light, eye=EYE, vertex=vertex, error=CENTERS),
         tolerance=TURNED,
     )
@@ -170,10 +160,12 @@ def test_any_function_of_two_directions_is_a_brdf(mesh, random, close):
     close(reference.radiance(mesh, model.__call__, light, **options), expected)
 
 
-@pytest.mark.parametrize("value", [lambda wi, wo: wi[..., 2], lambda wi, wo: 0.3, lambda wi, wo: jnp.ones(3)])
-def test_values_without_one_row_per_direction_are_refused(mesh, random, value):
-    with pytest.raises(ValueError, match=r"the BRDF must return \[384, c\] for 384 directions, got \["):
-        reference.radiance(mesh, value, some_light(random), eye=EYE)
+def test_values_without_one_row_per_direction_and_faces_that_are_no_power_of_two_are_refused(mesh, random):
+    for value in (lambda wi, wo: wi[..., 2], lambda wi, wo: 0.3, lambda wi, wo: jnp.ones(3)):
+        with pytest.raises(ValueError, match=r"the BRDF must return \[384, c\] for 384 directions, got \["):
+            reference.radiance(mesh, value, some_light(random), eye=EYE)
+    with pytest.raises(ValueError, match="power of two"):
+        reference.radiance(mesh, Lambert(0.5), Environment(jnp.ones((6, 6, 6, 3))), eye=EYE)
 
 
 def test_the_gradient_in_parameters_of_a_brdf_equals_finite_differences(mesh, random):
@@ -193,8 +185,3 @@ def test_an_eye_and_a_light_that_are_not_finite_are_refused(mesh, random):
         reference.radiance(mesh, GLOSSY, light, eye=EYE.at[1].set(jnp.nan))
     with pytest.raises(ValueError, match="the light must be finite, got 1152 of 1152"):
         reference.radiance(mesh, GLOSSY, jax.tree.map(lambda x: x * jnp.nan, light), eye=EYE)
-
-
-def test_lights_whose_faces_are_no_power_of_two_are_refused(mesh):
-    with pytest.raises(ValueError, match="power of two"):
-        reference.radiance(mesh, Lambert(0.5), Environment(jnp.ones((6, 6, 6, 3))), eye=EYE)

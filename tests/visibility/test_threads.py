@@ -21,7 +21,7 @@ from jaxprt.visibility.picture_rays import LampPlaces, PicturePoints, TexelRays
 
 COUNT = 4000  # rays of each path
 PATHS = ("blocked", "stopped", "passed", "hit", "layers", "shares", "lamps", "visibility")
-SETS = ("sse2", "sse4.2", "avx", "avx2", "avx512")
+SETS = ("sse2", "avx", "avx512")
 LENGTH = 0.7  # seconds of rays for each path; in version 0.3 twice that left 72 to 96 values wrong on most paths
 ROUNDED = 1e-4  # share of rays that pass an edge on its other side where products and sums are rounded apart
 
@@ -187,7 +187,7 @@ def run_beside(trace: dict[str, Callable[[], bytes]], threads: int, seconds: flo
         beside.join()
 
 
-@pytest.mark.parametrize("threads", [1, 2, 8])
+@pytest.mark.parametrize("threads", [1, 8])
 def test_rays_of_several_threads_are_those_of_one(threads, monkeypatch):
     trace = tracers()
     monkeypatch.setattr(blocks, "cores", lambda: 1)
@@ -198,10 +198,10 @@ def test_rays_of_several_threads_are_those_of_one(threads, monkeypatch):
 
 def test_stored_visibility_does_not_depend_on_the_number_of_threads(monkeypatch):
     mesh, found = soup(200, 0.2, 0.6), []
-    for threads in (1, 2, 8):
+    for threads in (1, 8):
         monkeypatch.setattr(blocks, "cores", lambda threads=threads: threads)
         found.append(np.asarray(visibility.precompute(mesh, size=8).level).tobytes())
-    assert found[0] == found[1] == found[2]
+    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize("name", SETS)

@@ -1,5 +1,6 @@
 """Reflected light of meshes whose regions are groups of their own."""
 
+import functools
 from collections.abc import Callable, Sequence
 
 import jax
@@ -7,9 +8,29 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxprt import harmonic
-from jaxprt.scene import Environment, Mesh
+from jaxprt.scene import Environment, Mesh, builtin
+from jaxprt.scene.mesh import make_mesh
 from jaxprt.sphere import directions
 from jaxprt.systems.bounces import GroupBounces, ReflectingPart, TransferTensor
+
+EYE = jnp.array([0.3, 3.0, 0.2])
+SKY = Environment(jax.device_put(np.ones((6, 8, 8, 3), np.float32)))
+OPTIONS = {"components": 40, "modes": 24, "edge": 2, "size": 16}
+
+
+@functools.cache
+def bowl() -> Mesh:
+    """Half a sphere of 225 vertices, seen from inside: each point sees it over half of its horizon, by the cosine."""
+    ball = builtin.sphere(rings=16, sectors=28)
+    low = np.all(np.asarray(ball.position)[np.asarray(ball.face), 1] < 1e-3, 1)
+    used, face = np.unique(np.asarray(ball.face)[low][:, ::-1], return_inverse=True)
+    return make_mesh(np.asarray(ball.position)[used], face.reshape(-1, 3), normal=-np.asarray(ball.normal)[used])
+
+
+def repeated(mesh: Mesh, count: int) -> Mesh:
+    """The mesh with its first vertex again and again, up to a number that scenes share."""
+    index = np.pad(np.arange(len(mesh.position)), (0, count - len(mesh.position)))
+    return make_mesh(np.asarray(mesh.position)[index], mesh.face, normal=np.asarray(mesh.normal)[index])
 
 
 def of_regions(mesh: Mesh, brdfs: Sequence[Callable], tensor: TransferTensor) -> GroupBounces:

@@ -10,7 +10,7 @@ from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.brdf.models import CookTorrance
 from jaxprt.sphere import harmonics, hemisphere
 
-RESOLUTION = 24
+RESOLUTION = 16
 UP = jnp.array([0.0, 0.0, 1.0])
 MEMBERS = [CookTorrance(diffuse=0.0, specular=1.0, roughness=m, f0=0.3) for m in (0.3, 0.4, 0.6)]
 
@@ -38,16 +38,16 @@ def test_the_error_of_functions_is_that_of_what_they_send():
     shared, weight = bounces.functions.shared(MEMBERS, functions=2, terms=6, resolution=RESOLUTION)
     exact, by_functions = sent(MEMBERS, shared, weight)
     size = np.linalg.norm(exact, axis=(1, 2))
-    missed = np.linalg.norm(by_functions - exact, axis=(1, 2)) / size
+    missed = np.linalg.norm(np.asarray(by_functions) - exact, axis=(1, 2)) / size
     assert float(shared.error) == pytest.approx(np.sqrt(np.mean(missed**2)), rel=0.02)
 
 
 def test_functions_are_followed_by_a_diffuse_one_and_as_few_as_the_brdfs():
-    shared, weight = bounces.functions.shared(MEMBERS[:1], functions=4, terms=8, resolution=8)
+    shared, weight = bounces.functions.shared(MEMBERS[:1], functions=4, terms=6, resolution=RESOLUTION)
     assert weight.shape == (1, 1, 2)
     np.testing.assert_array_equal(weight[..., -1], 0)
-    assert float(jnp.max(jnp.abs(weight[..., 0]))) == pytest.approx(1)
-    np.testing.assert_allclose(bounces.functions.albedo(shared)[-1], 1, rtol=2e-3)
+    assert np.max(np.abs(weight)[..., 0]) == pytest.approx(1)
+    np.testing.assert_allclose(np.asarray(bounces.functions.albedo(shared))[-1], 1, rtol=5e-3)
 
 
 @pytest.mark.parametrize(

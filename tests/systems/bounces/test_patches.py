@@ -13,83 +13,68 @@ from jaxprt.brdf import Lambert
 from jaxprt.scene import Environment, Mesh, builtin
 from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.systems.bounces import GroupBounces
-from tests.systems.bounces.reflected import of_regions, radiance
+from tests.systems.bounces.reflected import EYE, OPTIONS, SKY, bowl, of_regions, radiance, repeated
 
 pytestmark = pytest.mark.usefixtures("coarse")
 
-EYE = jnp.array([0.3, 3.0, 0.2])
-SKY = Environment(jnp.ones((6, 8, 8, 3)))
-OPTIONS = {"components": 40, "modes": 24, "edge": 2, "size": 16}
+COUNT = len(bowl().position)  # vertices of each region in all scenes, so that they are compiled once
+INSIDE = np.asarray(bowl().position)[:, 1] < -0.1
 
 
 @functools.cache
-def bowl() -> Mesh:
-    """Half a sphere, seen from inside: every point sees the bowl over half of its horizon, weighted by the cosine."""
-    ball = builtin.sphere(rings=16, sectors=20)
-    low = np.all(np.asarray(ball.position)[np.asarray(ball.face), 1] < 1e-3, 1)
-    used, face = np.unique(np.asarray(ball.face)[low][:, ::-1], return_inverse=True)
-    return make_mesh(ball.position[used], face.reshape(-1, 3), normal=-np.asarray(ball.normal)[used])
+def matte() -> separable.SeparableBrdf:
+    return separable.factor(Lambert(1.0), terms=1, resolution=8)
 
 
-def made(mesh: Mesh, albedo: float = 1.0, **options) -> GroupBounces:
-    """Reflected light between matte regions."""
+def made(mesh: Mesh, **options) -> GroupBounces:
+    """All bounces between white matte regions."""
     regions = np.unique(np.asarray(mesh.region)).tolist()
-    matte = separable.factor(Lambert(albedo), terms=1, resolution=8)
-    tensor = bounces.precompute(mesh, [matte] * len(regions), **OPTIONS | options)
-    return of_regions(mesh, [Lambert(albedo)] * len(regions), tensor)
+    tensor = bounces.precompute(mesh, [matte()] * len(regions), **OPTIONS | {"bounces": "all"} | options)
+    return of_regions(mesh, [Lambert(1.0)] * len(regions), tensor)
 
 
-def shown(system: GroupBounces, materials=None) -> np.ndarray:
-    return np.asarray(radiance(system, SKY, EYE, materials))
+@jax.jit
+def shown(system: GroupBounces, materials=None) -> jax.Array:
+    return radiance(system, SKY, EYE, materials)
 
 
 @functools.cache
 def settled() -> GroupBounces:
-    return made(bowl(), bounces="all")
+    return made(bowl())
 
 
 @pytest.mark.parametrize("albedo", [1.0, 0.8])
 def test_after_all_bounces_a_bowl_has_the_light_of_the_closed_form(albedo):
     """The furnace: 1/2 by direct light, and for albedo 1 the other half by all bounces."""
-    count = len(bowl().position)
-    blend = prt.Blend(jnp.full((count, 1, 1), albedo))
-    color = shown(settled(), [blend])
+    color = np.asarray(shown(settled(), [prt.Blend(jnp.full((COUNT, 1, 1), albedo))]))
     half = albedo / 2
-    inside = np.asarray(bowl().position)[:, 1] < -0.1
     expected = half * half / (1 - half)
-    np.testing.assert_allclose(color[inside], expected, rtol=0.03)
-    np.testing.assert_allclose(color[inside].mean(), expected, rtol=0.01)
+    np.testing.assert_allclose(color[INSIDE], expected, rtol=0.03)
+    np.testing.assert_allclose(color[INSIDE].mean(), expected, rtol=0.01)
 
 
 def test_every_bounce_adds_half_of_the_one_before_and_is_worth_it():
-    tensor = made(bowl(), bounces=5).tensor
-    np.testing.assert_allclose(tensor.worth, 0.5 ** np.arange(2, 7), rtol=0.04)
-    rest = settled().tensor.worth
-    assert rest.shape == (3,)
-    np.testing.assert_allclose(rest[2], 0.125, rtol=0.03)
+    tensor = settled().tensor
+    np.testing.assert_allclose(tensor.worth, [0.25, 0.125, 0.125], rtol=0.04)
     white = jnp.ones((len(tensor.function), 1))
     lit = bounces.tensor.light_side(tensor, SKY)
 
     def arriving(count):
-        patches = tensor.patches
-        own = bounces.Patches(**{**vars(patches), "bounces": count})
-        held = bounces.TransferTensor(**{**vars(tensor), "patches": own})
-        whole = bounces.tensor.collect(held, lit, white * tensor.factor[0])
-        return float(jnp.mean(whole[0])) * np.sqrt(4 * np.pi)
+        patches = bounces.Patches(**{**vars(tensor.patches), "bounces": count})
+        held = bounces.TransferTensor(**{**vars(tensor), "patches": patches})
+        return np.mean(bounces.tensor.collect(held, lit, white * tensor.factor[0])[0]) * np.sqrt(4 * np.pi)
 
-    each = np.array([arriving(count) for count in (2, 3, 4, 5, None)])
-    added = np.diff(each)
-    np.testing.assert_allclose(added[1:3] / added[:2], 0.5, rtol=0.02)
-    np.testing.assert_allclose(added[3], added[2], rtol=0.02)  # All that follow bring as much as the last of a half.
+    added = np.diff([arriving(count) for count in (2, 3, 4, None)])
+    np.testing.assert_allclose(added[1] / added[0], 0.5, rtol=0.02)
+    np.testing.assert_allclose(added[2], added[1], rtol=0.02)  # All that follow bring as much as the last of a half.
 
 
 def test_form_factors_and_the_light_add_up_to_one():
     patches = settled().tensor.patches
-    inside = np.asarray(bowl().position)[:, 1] < -0.1
     whole = np.asarray(patches.factor, np.float64).sum(1)
-    np.testing.assert_allclose(whole[inside], 0.5, atol=0.02)
+    np.testing.assert_allclose(whole[INSIDE], 0.5, atol=0.02)
     np.testing.assert_allclose(np.sum(patches.between, 1) + np.sum(patches.light, 1), 1, atol=2e-3)
-    np.testing.assert_allclose(patches.strength[0] @ settled().tensor.factor[0], 1, rtol=0.01)
+    np.testing.assert_allclose(np.dot(patches.strength[0], settled().tensor.factor[0]), 1, rtol=0.01)
     irradiance = np.sum(np.asarray(patches.spread) * bounces.gather.cosines(np.asarray(bowl().normal)), 1)
     np.testing.assert_allclose(irradiance, 1, atol=2e-3)
 
@@ -112,72 +97,73 @@ MIXED = 0.08
 
 @pytest.mark.parametrize("count", [2, "all"])
 def test_a_wall_of_two_colors_lights_a_floor_as_two_walls_of_a_color_each(count):
-    red, blue = np.array([0.9, 0.1, 0.1], np.float32), np.array([0.1, 0.1, 0.9], np.float32)
-    exact_mesh, mesh = corner(split=True), corner(split=False)
-    regions = np.bincount(np.asarray(exact_mesh.region))
-    blends = [prt.Blend(jnp.full((regions[0], 1, 1), 0.9))]
-    blends += [prt.Blend(jnp.tile(color, (n, 1, 1))) for n, color in zip(regions[1:], (red, blue), strict=True)]
-    exact = shown(made(exact_mesh, bounces=count), blends)[: regions[0]]
-    position = np.asarray(mesh.position)[np.asarray(mesh.region) == 1]
+    red, blue = np.float32([0.9, 0.1, 0.1]), np.float32([0.1, 0.1, 0.9])
+    halves = np.bincount(np.asarray(corner(split=True).region))[1:]
+    floor = prt.Blend(jnp.full((COUNT, 1, 1), 0.9))
+    walls = [prt.Blend(jnp.asarray(np.tile(color, (n, 1, 1)))) for n, color in zip(halves, (red, blue), strict=True)]
+    exact = np.asarray(shown(made(corner(split=True), bounces=count), [floor, *walls]))[:COUNT]
+    position = np.asarray(corner(split=False).position)[COUNT:]
     share = np.clip(0.5 - position[:, :1] * 3.5, 0, 1)
-    painted = prt.Blend(jnp.asarray((share * red + (1 - share) * blue)[:, None], jnp.float32))
-    system = made(mesh, bounces=count)
-    found = shown(system, [blends[0], painted])[: regions[0]]
+    painted = (share * red + (1 - share) * blue)[:, None].astype(np.float32)
+    system = made(corner(split=False), bounces=count)
+    found, plain = (
+        np.asarray(shown(system, [floor, prt.Blend(jnp.asarray(weight))]))[:COUNT]
+        for weight in (painted, np.broadcast_to(painted.mean(0), painted.shape))
+    )
     assert np.linalg.norm(found - exact) < MIXED * np.linalg.norm(exact)
-    mean = jnp.broadcast_to(jnp.mean(painted.weight, 0), painted.weight.shape)
-    plain = shown(system, [blends[0], prt.Blend(mean)])[: regions[0]]
     assert np.linalg.norm(plain - exact) > 0.3 * np.linalg.norm(exact)
 
 
 def test_gradients_of_all_bounces_are_finite_differences():
-    system, count = settled(), len(bowl().position)
-    texture = jnp.asarray(np.random.default_rng(0).uniform(0.2, 0.8, (count, 1, 3)), jnp.float32)
+    texture = np.random.default_rng(0).uniform(0.2, 0.8, (COUNT, 1, 3)).astype(np.float32)
+    along = np.arange(COUNT, dtype=np.float32)[:, None, None] / COUNT
 
     @jax.jit
     def total(step, light_step):
-        blend = prt.Blend(texture * (1 + step * jnp.arange(count)[:, None, None] / count))
         light = Environment(SKY.radiance.at[2].multiply(1 + light_step))
-        return jnp.mean(radiance(system, light, EYE, [blend]))
+        return jnp.mean(radiance(settled(), light, EYE, [prt.Blend(texture * (1 + step * along))]))
 
-    slope = jax.grad(total, (0, 1))(0.0, 0.0)
+    slope = jax.jit(jax.grad(total, (0, 1)))(0.0, 0.0)
     for number, each in enumerate(slope):
         ends = [float(total(*np.eye(2)[number] * step)) for step in (0.05, -0.05)]
         np.testing.assert_allclose(each, (ends[0] - ends[1]) / 0.1, rtol=5e-3)
 
 
 def test_a_closed_white_room_without_light_stays_dark():
-    ball = builtin.sphere(rings=10, sectors=12)
-    room = make_mesh(ball.position, ball.face[:, ::-1], normal=-ball.normal)
-    system = made(room, bounces="all")
+    ball = builtin.sphere(rings=8, sectors=31)
+    inward = make_mesh(ball.position, np.asarray(ball.face)[:, ::-1], normal=-np.asarray(ball.normal))
+    system = made(repeated(inward, COUNT))
     np.testing.assert_allclose(system.tensor.worth, 0, atol=1e-6)
     np.testing.assert_allclose(shown(system), 0, atol=1e-6)
-    np.testing.assert_allclose(np.sum(system.tensor.patches.between, 1), 1, atol=2e-3)
-    slope = jax.grad(lambda x: jnp.sum(radiance(system, Environment(x), EYE)))(SKY.radiance)
-    assert np.isfinite(slope).all()
+    between = np.sum(system.tensor.patches.between, 1)  # Patches of what is repeated have no area.
+    np.testing.assert_allclose(between[between > 0], 1, atol=2e-3)
+    assert np.mean(between > 0) > 0.9
 
 
 def test_faces_twice_in_opposite_orientation_reflect_as_their_fronts():
     """The bowl with a second skin that faces outward: what is inside stays as it was."""
-    inner = bowl()
-    outer = make_mesh(inner.position, inner.face[:, ::-1], normal=-inner.normal)
-    both = shown(made(join([inner, outer]), bounces="all"))
+    outer = make_mesh(bowl().position, np.asarray(bowl().face)[:, ::-1], normal=-np.asarray(bowl().normal))
+    both = np.asarray(shown(made(join([bowl(), outer]))))
     assert np.isfinite(both).all()
-    inside = np.asarray(inner.position)[:, 1] < -0.1
-    np.testing.assert_allclose(both[: len(inside)][inside].mean(), 0.5, rtol=0.03)
-    np.testing.assert_allclose(both[len(inside) :][inside], 0, atol=1e-5)
+    np.testing.assert_allclose(both[:COUNT][INSIDE].mean(), 0.5, rtol=0.03)
+    np.testing.assert_allclose(both[COUNT:][INSIDE], 0, atol=1e-5)
 
 
-def test_one_triangle_has_one_patch_and_no_reflected_light():
-    one = make_mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, -1]]), np.array([[0, 1, 2]]))
-    system = made(one, bounces="all")
-    assert system.tensor.patches.between.shape == (1, 1)
-    np.testing.assert_array_equal(shown(system), 0)
+def test_backs_of_surfaces_send_no_light():
+    """A lid over the bowl that faces up: the bowl sees its back."""
+    lid = builtin.plane(cells=14)
+    above = make_mesh(np.asarray(lid.position) + np.float32([0, 0.2, 0]), lid.face, normal=lid.normal)
+    traced = bounces.patches.exchange(join([bowl(), above]), patches=64, size=16, edge=2)
+    own, back = (traced.factor[:COUNT, traced.region == region] for region in (0, 1))
+    assert own.max() > 0.01
+    np.testing.assert_array_equal(back, np.zeros((COUNT, np.sum(traced.region == 1))))
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_numbers_of_patches_and_bounces_that_are_none_are_refused():
     for options, message in (
         ({"bounces": "both"}, "bounces must be a whole number of at least 1, or 'all', got 'both'"),
+        ({"bounces": 0}, "bounces must be a whole number of at least 1, or 'all', got 0"),
         ({"patches": 0}, "patches must be at least 1, got 0"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -6,22 +6,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.published.interreflection import interreflect_diffuse
-from jaxprt import bounces, harmonic, separable, visibility
+from jaxprt import bounces, separable, visibility
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.brdf.models import CookTorrance
 from jaxprt.brdf.varying import Channels
 from jaxprt.scene import Environment, builtin
-from jaxprt.scene.mesh import ground_plane, join, make_mesh
+from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.sphere import cubemap, directions, haar, harmonics
 from jaxprt.systems.bounces.tensor import LitTransfer
-from jaxprt.systems.harmonic import TransferVector
 from jaxprt.visibility import Run
 
 # Edges of cubemap faces: EDGE divides the light, SIZE the rays between surfaces, SEEN the visibility of the light.
 EDGE, SIZE, SEEN = 4, 8, 16
 BLOCK = 512
 ALL = 10**6
+FEW = {"components": 8, "modes": 8, "edge": 2, "size": SIZE}
 
 
 @pytest.fixture(scope="module")
@@ -46,53 +45,23 @@ def whole(mesh, brdfs):
 
 def light(seed, edge=EDGE):
     """Random texels, constant over the texels of two bounces."""
-    value = np.random.default_rng(seed).uniform(size=(6, 2, 1, 2, 1, 3))
-    return Environment(jnp.asarray(np.broadcast_to(value, (6, 2, edge // 2, 2, edge // 2, 3)), jnp.float32).reshape(
-        6, edge, edge, 3
-    ))  # fmt: skip
+    value = np.random.default_rng(seed).uniform(size=(6, 2, 1, 2, 1, 3)).astype(np.float32)
+    whole = np.broadcast_to(value, (6, 2, edge // 2, 2, edge // 2, 3)).reshape(6, edge, edge, 3)
+    return Environment(jax.device_put(whole))
 
 
 def arriving(tensor, environment, weight=None):
     """SH coefficients of one bounce and of two, [v s c]."""
     lit = bounces.tensor.light_side(tensor, environment)
     if weight is None:
-        weight = jnp.concatenate([jnp.broadcast_to(each, (len(each), 3)) for each in tensor.factor])[tensor.function]
+        rows = [np.broadcast_to(each, (len(each), 3)) for each in tensor.factor]
+        weight = jnp.asarray(np.concatenate(rows)[np.asarray(tensor.function)])
     both, one = (np.asarray(bounces.tensor.collect(tensor, x, weight)) for x in (lit, LitTransfer(lit.first, None)))
     return one.transpose(2, 0, 1), (both - one).transpose(2, 0, 1)
 
 
 def relative(value, exact):
     return float(np.linalg.norm(value - exact) / np.linalg.norm(exact))
-
-
-def test_bounces_under_constant_light_are_those_of_the_harmonic_system():
-    """Irradiance: all but what harmonics beyond degree three bring, of what arrives first."""
-    ball = builtin.sphere(rings=8, sectors=10)
-    mesh = join([ball, ground_plane(ball, vertices=64)])
-    albedo = np.array([[0.9, 0.5, 0.2], [0.3, 0.6, 0.8]], np.float32)
-    fixed = [separable.factor(Lambert(each), terms=1, resolution=8) for each in albedo]
-    tensor = bounces.precompute(mesh, fixed, components=ALL, modes=ALL, edge=EDGE, size=SEEN)
-    assert tensor.error.max() < 1e-3
-    once, twice = arriving(tensor, Environment(jnp.ones((6, EDGE, EDGE, 3))))
-    cosine = np.pi * np.array([1, 2 / 3, 1 / 4, 0])[[0, *[1] * 3, *[2] * 5, *[3] * 7]]
-    at = np.asarray(harmonics.evaluate(mesh.normal, degree=3)) * cosine / np.pi
-    plain = harmonic.precompute_diffuse(mesh, degree=0, size=SEEN)
-
-    def exact(albedo):
-        """Radiance [c v] of one bounce and of two, the second by rays through faces of half the edge."""
-        one = interreflect_diffuse(mesh, plain, albedo, size=SEEN)
-        first = TransferVector(one.vector - plain.vector, plain.position)
-        both = interreflect_diffuse(mesh, first, albedo, size=SEEN // 2)
-        return [np.asarray(row)[0] * np.sqrt(4 * np.pi) for row in (first.vector, both.vector - first.vector)]
-
-    first, second = exact(albedo)
-    assert relative(np.einsum("vs,vsc->vc", at, once), first.T) < 0.014
-    assert relative(np.einsum("vs,vsc->vc", at, twice), second.T) < 0.018
-    # The rays of the second bounce, a quarter of those of the first, leave 3.4 % of it.
-    finer = [interreflect_diffuse(mesh, plain, albedo, bounces=count, size=SEEN).vector for count in (1, 2)]
-    assert relative(second, np.asarray(finer[1] - finer[0])[0] * np.sqrt(4 * np.pi)) < 0.035
-    brought = [np.sqrt(np.mean(row**2)) for row in exact(albedo.max(1, keepdims=True))]
-    assert np.all(np.abs(np.divide(tensor.worth, brought) - 1) < [0.003, 0.015])
 
 
 def test_two_bounces_are_a_loop_over_rays_of_rays(mesh, brdfs, whole):
@@ -150,54 +119,16 @@ TWICE = 0.025
 
 def test_one_bounce_is_linear_in_the_weights_and_two_are_quadratic(whole):
     random = np.random.default_rng(0)
-    a, b = (jnp.asarray(random.uniform(size=(3, 3)), jnp.float32) for _ in range(2))
-    found = {name: arriving(whole, light(2), x) for name, x in {"a": a, "b": b, "+": a + b, "-": a - b}.items()}
+    a, b = (random.uniform(size=(3, 3)).astype(np.float32) for _ in range(2))
+    found = {
+        name: arriving(whole, light(2), jnp.asarray(x)) for name, x in {"a": a, "b": b, "+": a + b, "-": a - b}.items()
+    }
     np.testing.assert_allclose(found["+"][0], found["a"][0] + found["b"][0], atol=1e-6)
     parallelogram = found["+"][1] + found["-"][1]
     np.testing.assert_allclose(parallelogram, 2 * (found["a"][1] + found["b"][1]), atol=1e-6)
-    np.testing.assert_allclose(arriving(whole, light(2), 3 * a)[1], 9 * found["a"][1], rtol=1e-4, atol=1e-6)
-
-
-def test_diffuse_surfaces_exchange_light_reciprocally():
-    """Two parallel squares of unlike size: area times form factor is the same both ways."""
-    small, large = builtin.plane(cells=8), builtin.plane(cells=16)
-    up = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
-    down = up * [[1], [-1], [-1]]
-    scale = (0.5, 1.0)
-    parts = []
-    for each, size, axes, height in zip((small, large), scale, (down, up), (0.6, 0.0), strict=True):
-        position = np.asarray(each.position) * size @ axes.T + [0, height, 0]
-        parts.append((position.astype(np.float32), np.asarray(each.face), np.asarray(each.normal) @ axes.T, size))
-    scene = join([make_mesh(p, f, normal=n.astype(np.float32)) for p, f, n, _ in parts])
-    frame = directions.frame(scene.normal, scene.tangent)
-    white = bounces.functions.basis(separable.factor(Lambert(1.0), terms=1, resolution=8))
-    occluder = visibility.Occluder(scene)
-    start = visibility.start_points(scene, occluder)
-    size = 32
-    found = bounces.gather.rays(
-        occluder, start, np.asarray(scene.normal), np.asarray(frame), np.asarray(scene.region), size=size
+    np.testing.assert_allclose(
+        arriving(whole, light(2), jnp.asarray(3 * a))[1], 9 * found["a"][1], rtol=1e-4, atol=1e-6
     )
-    way, area = (np.asarray(x(size=size)).reshape(-1, 3) for x in (cubemap.direction, cubemap.vector_area))
-    flux = np.maximum(np.asarray(scene.normal) @ area.T, 0) / np.pi
-    weight = float(bounces.functions.fixed_weights(separable.factor(Lambert(1.0), terms=1, resolution=8))[0, 0])
-    received = []
-    for number, (_, _, _, edge) in enumerate(parts):
-        shining = np.zeros((len(start), 1, 1), np.float32) + np.float32(np.pi) / np.float32(
-            np.asarray(white.light_map).mean()
-        )
-        rays = found[1 - number]
-        each = flux[rays.owner[:, None], rays.texel][..., None]
-        fixed = (rays.owner, rays.corner, rays.weight, way[rays.texel], each)
-        none = np.zeros((len(start), 1, 1, 1), np.float32)
-        arrived = np.asarray(bounces.gather.arrive(none, jnp.asarray(shining), frame, white, *fixed))
-        own = np.asarray(scene.region) == number
-        cells = round(np.sqrt(own.sum()))
-        line = np.ones(cells)
-        line[[0, -1]] = 0.5  # the trapezoidal rule
-        mean = np.average(arrived[own, 0, 0, 0], weights=np.outer(line, line).ravel()) * weight
-        received.append((2 * edge) ** 2 * mean)
-    assert received[0] > 0.1
-    np.testing.assert_allclose(received[0], received[1], rtol=1e-5)
 
 
 def test_fewer_components_and_modes_err_as_they_say(mesh, brdfs, whole):
@@ -228,7 +159,7 @@ def changing():
 
 def test_what_brings_little_is_left_out_and_told(mesh, changing, capsys):
     dark = separable.factor(Lambert(0.01), terms=1, resolution=8)
-    options = {"components": 8, "modes": 8, "edge": 2, "size": 8}
+    options = FEW
     every = bounces.precompute(mesh, [changing, dark], **options)
     few = bounces.precompute(mesh, [changing, dark], least=0.05, **options)
     assert len(every.function) == 4
@@ -250,45 +181,37 @@ def test_channels_with_weights_are_worth_what_the_brdf_is_that_they_add_up_to(me
     whole = CookTorrance(**glossy | {"diffuse": 0.4 + 0.5 * 0.3, "specular": 0.5 * 0.7})
     brdfs = Channels((Lambert(1.0), CookTorrance(**glossy)), jnp.ones(2)), whole
     channels, alone = (separable.factor(each, terms=8, resolution=12) for each in brdfs)
-    options = {"components": ALL, "modes": ALL, "edge": 2, "size": 8}
+    options = {"components": ALL, "modes": ALL, "edge": 2, "size": SIZE}
     exact = bounces.precompute(mesh, [alone, alone], **options).worth
     found = bounces.precompute(mesh, [alone, channels], weights=[None, weight], **options).worth
     np.testing.assert_allclose(found, exact, rtol=0.01)
     assert np.all(bounces.precompute(mesh, [alone, channels], **options).worth > 1.1 * exact)
 
 
-def test_a_coarse_light_is_where_the_light_is():
-    np.testing.assert_allclose(cubemap.coarse(jnp.full((6, 16, 16, 1), 0.3), edge=4), 0.3, rtol=1e-5)
-    fine = jnp.asarray(np.random.default_rng(1).uniform(size=(6, 16, 16, 3)), jnp.float32)
-    wide, narrow = (np.asarray(cubemap.solid_angle(size=n)).reshape(-1, 1) for n in (4, 16))
-    flux = np.sum(cubemap.coarse(fine, edge=4) * wide, 0)
-    np.testing.assert_allclose(flux, (narrow * fine.reshape(-1, 3)).sum(0), rtol=0.002)
-    np.testing.assert_allclose(cubemap.coarse(fine, edge=16), fine.reshape(-1, 3), rtol=1e-5, atol=1e-6)
-    with pytest.raises(ValueError, match="the light's faces, 16, got 5"):
-        cubemap.coarse(fine, edge=5)
-
-
-@pytest.mark.parametrize("size", [4, 8])
-def test_the_middle_of_a_sun_stays_in_place(size):
+@pytest.mark.parametrize(("size", "kept"), [(4, 0.05), (8, 0.025)])
+def test_a_coarse_light_keeps_the_flux_and_the_middle_of_a_sun_in_place(size, kept):
     """Within .04 of a coarse texel; in the middle of one alone it would be off by up to .7."""
-    area = np.asarray(cubemap.solid_angle(size=size)).ravel()
-    place, fine = (np.asarray(cubemap.point(size=n)).reshape(-1, 3) for n in (size, 64))
-    texels = np.random.default_rng(2).integers(0, 64**2, 60)
-    suns = np.zeros((6 * 64**2, len(texels)), np.float32)
-    suns[texels, np.arange(len(texels))] = 1  # A color for each.
-    flux = np.asarray(cubemap.coarse(jax.device_put(suns.reshape(6, 64, 64, -1)), edge=size)) * area[:, None]
-    at = fine[texels]
+    area, fine = np.asarray(cubemap.solid_angle(size=size)).ravel(), 64
+    point, fine_point = (np.asarray(cubemap.point(size=n)).reshape(-1, 3) for n in (size, fine))
+    texel = np.random.default_rng(2).integers(0, fine**2, 60)
+    sun = np.zeros((6 * fine**2, len(texel)), np.float32)
+    sun[texel, np.arange(len(texel))] = 1  # a color for each
+    flux = np.asarray(cubemap.coarse(jax.device_put(sun.reshape(6, fine, fine, -1)), edge=size)) * area[:, None]
+    at = fine_point[texel]
     own = np.sort(np.abs(at))[:, 1] <= 1 - 1 / size  # Others are shared with other faces.
     flux, at = flux[:, own], at[own]
-    off = np.linalg.norm(flux.T @ place / flux.sum(0)[:, None] - at, axis=1) / (2 / size)
-    total = np.asarray(cubemap.solid_angle(size=64)).ravel()[texels[own]]
-    np.testing.assert_allclose(flux.sum(0), total, rtol={4: 0.05, 8: 0.025}[size])
+    off = np.linalg.norm(flux.T @ point / flux.sum(0)[:, None] - at, axis=1) / (2 / size)
+    np.testing.assert_allclose(flux.sum(0), np.asarray(cubemap.solid_angle(size=fine)).ravel()[texel[own]], rtol=kept)
     assert len(off) > 20
     assert max(off) < 0.04
+    some = jax.device_put(np.random.default_rng(1).uniform(size=(6, size, size, 3)).astype(np.float32))
+    np.testing.assert_allclose(cubemap.coarse(some, edge=size), some.reshape(-1, 3), rtol=1e-5, atol=1e-6)
+    with pytest.raises(ValueError, match=f"the light's faces, {size}, got 5"):
+        cubemap.coarse(some, edge=5)
 
 
 def test_a_stopped_precomputation_goes_on(mesh, brdfs, tmp_path):
-    options = {"components": 8, "modes": 8, "edge": 2, "size": 8, "run": Run(tmp_path / "bounce")}
+    options = FEW | {"run": Run(tmp_path / "bounce")}
     first, again = (bounces.precompute(mesh, brdfs, **options) for _ in range(2))
     np.testing.assert_array_equal(first.core, again.core)
     np.testing.assert_array_equal(first.second.core, again.second.core)
@@ -296,26 +219,17 @@ def test_a_stopped_precomputation_goes_on(mesh, brdfs, tmp_path):
         bounces.precompute(mesh, brdfs[::-1], **options)
 
 
-def test_what_makes_no_tensor_is_refused(mesh, brdfs):
-    with pytest.raises(ValueError, match=r"one for each of the regions \[0, 1\], got 1"):
-        bounces.precompute(mesh, brdfs[:1])
-    with pytest.raises(ValueError, match="a power of two, got 0, 64, 8 and 16"):
-        bounces.precompute(mesh, brdfs, components=0)
-    with pytest.raises(ValueError, match="a power of two, got 32, 64, 6 and 16"):
-        bounces.precompute(mesh, brdfs, edge=6)
-    with pytest.raises(ValueError, match="bounces must be a whole number of at least 1, or 'all', got 0"):
-        bounces.precompute(mesh, brdfs, bounces=0)
-    with pytest.raises(ValueError, match="patches must be at least 1, got 0"):
-        bounces.precompute(mesh, brdfs, patches=0)
-
-
 @pytest.mark.usefixtures("unchecked")
-def test_weights_of_other_regions_and_channels_are_refused(mesh, brdfs):
-    def refused(weights, message):
+def test_what_makes_no_tensor_is_refused(mesh, brdfs):
+    one, two, three = jnp.ones(3), jnp.ones((2, 3)), jnp.full((3, 1), jnp.nan)
+    for given, options, message in (
+        (brdfs[:1], {}, r"one for each of the regions \[0, 1\], got 1"),
+        (brdfs, {"components": 0}, "a power of two, got 0, 64, 8 and 16"),
+        (brdfs, {"edge": 6}, "a power of two, got 32, 64, 6 and 16"),
+        (brdfs, {"weights": [None]}, "one entry, an array or None, for each of 2 regions, got 1"),
+        (brdfs, {"weights": [None, two]}, r"the weights of region 1 must be \[3 channels, c\], got \[2, 3\]"),
+        (brdfs, {"weights": [one, None]}, r"the weights of region 0 must be \[3 channels, c\], got \[3\]"),
+        (brdfs, {"weights": [three, None]}, r"the weights of region 0 must be finite, got 3 of 3"),
+    ):
         with pytest.raises(ValueError, match=message):
-            bounces.precompute(mesh, brdfs, weights=weights)
-
-    refused([None], "weights must have one entry, an array or None, for each of 2 regions, got 1")
-    refused([None, jnp.ones((2, 3))], r"the weights of region 1 must be \[3 channels, c\], got \[2, 3\]")
-    refused([jnp.ones(3), None], r"the weights of region 0 must be \[3 channels, c\], got \[3\]")
-    refused([jnp.full((3, 1), jnp.nan), None], r"the weights of region 0 must be finite, got 3 of 3")
+            bounces.precompute(mesh, given, **options)

@@ -1,5 +1,6 @@
 """The dynamic system: degenerate input gives finite, bounded radiance."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,7 +12,6 @@ from jaxprt.brdf.varying import Channels
 from jaxprt.scene import Environment, builtin
 
 SIZE = 8
-HORIZON = 1e-3  # 2 x 2 points in each texel that the horizon cuts, against the integral: measured 4.5e-4.
 RESOLUTION = 8
 EYE = (0.5, 1.0, 3.0)
 KNOTS = [np.log([0.01, 1.0])]
@@ -61,10 +61,9 @@ def color(system, place, light, eye=EYE, diffuse=0.2, specular=1.0):
     return np.asarray(prt.radiance(system, light, eye=jnp.asarray(eye), materials=blend))
 
 
-@pytest.mark.parametrize("specular", [[0.0, 0.5, 1.0], [0.0, 0.0]])
-def test_sets_of_low_rank(specular):
-    """Multiples of one BRDF and black ones: of rank one or less, whatever is asked for."""
-    models = tuple(CookTorrance(diffuse=0.0, specular=weight, roughness=0.3) for weight in specular)
+def test_sets_of_low_rank():
+    """Multiples of one BRDF and a black one: of rank one, whatever is asked for."""
+    models = tuple(CookTorrance(diffuse=0.0, specular=weight, roughness=0.3) for weight in (0.0, 0.5, 1.0))
     many, one = (
         dynamic.tabulate(Channels(brdfs, jnp.ones(len(brdfs))), lobes=0, ranks=(2, 4, 4), resolution=RESOLUTION)
         for brdfs in (models, models[-1:])
@@ -72,32 +71,19 @@ def test_sets_of_low_rank(specular):
     arrays = many.core, many.factor, many.view_map, many.light_map, many.error, many.lobe.diffuse
     assert all(np.isfinite(array).all() for array in arrays)
     wi, wo = directions(0.3, 0.7, 0.99)
-    np.testing.assert_allclose(many(wi, wo)[..., -1:], one(wi, wo), rtol=1e-4, atol=1e-5)
-
-
-def test_a_constant_tensor():
-    flat = dynamic.tabulate(lambda wi, wo: 0 * wi[..., 2:] + 0.25, lobes=0, ranks=(1, 3, 3), resolution=RESOLUTION)
-    wi, wo = directions(0.3, 0.7, 0.99)
-    np.testing.assert_allclose(flat(wi, wo), 0.25, rtol=1e-5)
-    assert flat.error < 1e-5
+    found, expected = (np.asarray(jax.jit(lambda table: table(wi, wo))(table)) for table in (many, one))
+    np.testing.assert_allclose(found[..., -1:], expected, rtol=1e-4, atol=1e-5)
 
 
 def test_a_sun_in_one_texel_is_exact(mesh, system):
     """All of the light is lit by one by one, with the BRDF at the center of the texel."""
-    sun = jnp.zeros((6 * SIZE * SIZE, 3)).at[77].set(100.0).reshape(6, SIZE, SIZE, 3)
+    sun = np.zeros((6 * SIZE * SIZE, 3), np.float32)
+    sun[77] = 100
+    sun = jax.device_put(sun.reshape(6, SIZE, SIZE, 3))
     model = CookTorrance(diffuse=0.2, specular=1.0, roughness=1.0, f0=0.5)
     exact = reference.radiance(mesh, model, Environment(sun), eye=jnp.asarray(EYE), error=np.inf)
     lit = color(system, 0.0, Environment(sun))
     assert np.linalg.norm(lit - exact) < 1e-6 * np.linalg.norm(exact)
-
-
-def test_a_furnace_of_diffuse_parts_is_white(mesh, system):
-    """Constant light, and no specular part; what a vertex of a coarse sphere does not see are its own faces."""
-    white = Environment(jnp.ones((6, SIZE, SIZE, 3)))
-    radiance = color(system, -2.3, white, diffuse=1.0, specular=0.0)[:, 0]
-    exact = np.asarray(reference.radiance(mesh, Lambert(1.0), white, eye=jnp.asarray(EYE), error=1e-5))[:, 0]
-    assert (exact > 0.9).sum() > 5
-    np.testing.assert_allclose(radiance, exact, atol=HORIZON)
 
 
 @pytest.mark.parametrize("place", [-50.0, 50.0])

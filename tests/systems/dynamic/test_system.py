@@ -2,6 +2,8 @@
 
 import dataclasses
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,16 +19,16 @@ from jaxprt.systems.standard import METALLIC_ROUGHNESS
 
 SIZE = 16
 EYE = jnp.array([1.5, 2.0, 2.5])
-ROUGHNESS = (0.3, 0.5, 0.8, 1.0)
+ROUGHNESS = (0.3, 1.0, "varying")
 # Relative L2 error against the sum over all texels, at each roughness. The lobe system errs by as much.
-ERROR = {"with a tensor": 0.06, "with lobes alone": 0.06, "with a tensor alone": 0.35}
+ERROR = {"with a tensor": 0.06, "with lobes alone": 0.06}
 
 
 @pytest.fixture(scope="module")
 def seen():
     """Visibility of a ball on a floor."""
     ball, floor = builtin.sphere(rings=10, sectors=16), builtin.plane(cells=6)
-    position = ball.position + np.array([0, 0.9, 0], np.float32)
+    position = jax.device_put(np.asarray(ball.position) + np.float32([0, 0.9, 0]))
     mesh = prt.scene.mesh.join([dataclasses.replace(ball, position=position), floor])
     return visibility.precompute(mesh, size=SIZE)
 
@@ -42,16 +44,13 @@ def materials(vertices, roughness):
     """A colored material, as a blend of the standard table's channels."""
     base = np.random.default_rng(1).uniform(0.2, 1, (vertices, 3)).astype(np.float32)
     model = MetallicRoughness(base_color=base, metallic=np.full(vertices, 0.4, np.float32))
-    weight = model.coefficient() / jnp.asarray(METALLIC_ROUGHNESS.scale, jnp.float32)[:, None]
-    return Blend(weight, (jnp.asarray(np.log(np.broadcast_to(roughness, vertices)), jnp.float32),))
+    weight = np.asarray(model.coefficient()) / np.asarray(METALLIC_ROUGHNESS.scale, np.float32)[:, None]
+    return Blend(jnp.asarray(weight), (jnp.asarray(np.log(np.broadcast_to(roughness, vertices)), jnp.float32),))
 
 
 BRDFS = {
     "with a tensor": lambda: METALLIC_ROUGHNESS.tensor(),
     "with lobes alone": lambda: METALLIC_ROUGHNESS.tensor(12, None),
-    "with a tensor alone": lambda: dynamic.tabulate(
-        METALLIC_ROUGHNESS.family, lobes=0, ranks=(6, 24, 24), knot=(METALLIC_ROUGHNESS.knot[10:],)
-    ),
 }
 
 
@@ -64,8 +63,8 @@ def system(request, seen):
 
 def exact(seen, light, blend):
     """The sum over all texels, with the same visibility and the BRDF itself."""
-    every = jnp.arange(6 * SIZE**2)
-    radiance = light.radiance.reshape(-1, 3)
+    every = jnp.asarray(np.arange(6 * SIZE**2, dtype=np.int32))
+    radiance = jnp.asarray(np.asarray(light.radiance).reshape(-1, 3))
     family = METALLIC_ROUGHNESS.family
     return np.asarray(bright_texels.radiance(seen, family, every, radiance, eye=EYE, samples=4, blend=blend))
 
@@ -77,13 +76,8 @@ def off(found, true):
 @pytest.mark.parametrize("roughness", ROUGHNESS)
 def test_radiance_is_that_of_the_exact_sum(system, seen, light, roughness):
     name, dynamic_system = system
-    blend = materials(len(seen.position), roughness)
-    assert off(prt.radiance(dynamic_system, light, eye=EYE, materials=blend), exact(seen, light, blend)) < ERROR[name]
-
-
-def test_roughness_may_vary_over_the_surface(system, seen, light):
-    name, dynamic_system = system
-    roughness = np.random.default_rng(2).uniform(0.3, 1, len(seen.position)).astype(np.float32)
+    if roughness == "varying":
+        roughness = np.random.default_rng(2).uniform(0.3, 1, len(seen.position)).astype(np.float32)
     blend = materials(len(seen.position), roughness)
     assert off(prt.radiance(dynamic_system, light, eye=EYE, materials=blend), exact(seen, light, blend)) < ERROR[name]
 
@@ -108,9 +102,10 @@ def test_points_with_a_tilted_normal_reflect_around_it(seen, system):
     weight = np.zeros((3, count), np.float32)
     weight[0] = 1
     points = Points(jnp.asarray(corner), jnp.asarray(weight))
-    straight = points.tilted(np.asarray(seen.frame[:, 2]))
+    normal = np.asarray(seen.frame)[:, 2]
+    straight = points.tilted(normal)
     lit = dynamic_system.shade(dynamic_system.light(sky))
-    tilted = dynamic_system.tilted(lit, jnp.asarray(seen.frame[:, 2]))
+    tilted = dynamic_system.tilted(lit, jnp.asarray(normal))
     found = dynamic_system.combine(tilted, dynamic_system.view(EYE, blend, straight), straight)
     np.testing.assert_allclose(
         found, dynamic_system.combine(lit, dynamic_system.view(EYE, blend)), rtol=2e-3, atol=2e-3
@@ -118,13 +113,15 @@ def test_points_with_a_tilted_normal_reflect_around_it(seen, system):
 
 
 def test_rays_read_its_lobes_widened_and_its_terms_as_they_are(seen, light, system):
-    name, dynamic_system = system
+    _, dynamic_system = system
     blend, options = materials(len(seen.position), 0.1), {"brdf": METALLIC_ROUGHNESS.family, "count": 8}
     whole, lobes = (
         bright_texels.BrightTexels(of, dynamic_system.transport.pyramid, **options)
         for of in (dynamic_system, dynamic_system.lobe_part)
     )
-    sun = Environment(jnp.zeros((6, SIZE, SIZE, 3)).at[2, 8, 8].set(100.0))
+    radiance = np.zeros((6, SIZE, SIZE, 3), np.float32)
+    radiance[2, 8, 8] = 100
+    sun = Environment(jax.device_put(radiance))
 
     def read(of, environment, variance):
         lit = of.shade(of.light(environment))
@@ -134,16 +131,18 @@ def test_rays_read_its_lobes_widened_and_its_terms_as_they_are(seen, light, syst
     assert widened.can_widen(whole)
     plain = prt.radiance(dynamic_system, light, eye=EYE, materials=blend)
     np.testing.assert_allclose(read(dynamic_system, light, 0.0), plain, rtol=1e-4, atol=1e-4)
-    if name != "with a tensor alone":
-        wide = read(whole, sun, 0.3)
-        assert off(wide, read(lobes, sun, 0.3)) < 0.1
-        assert off(wide, read(whole, sun, 0.0)) > 0.3
+    wide = read(whole, sun, 0.3)
+    assert off(wide, read(lobes, sun, 0.3)) < 0.1
+    assert off(wide, read(whole, sun, 0.0)) > 0.3
 
 
-def test_transport_of_another_brdf_is_refused(seen):
-    one, other = (dynamic.tabulate(prt.brdf.GGX(1.0, r), lobes=0, ranks=(1, 4, 4)) for r in (0.4, 0.6))
-    transport = dynamic.compress(seen, one)
+def test_transport_of_another_brdf_is_refused(system):
+    name, dynamic_system = system
+    if name == "with lobes alone":
+        pytest.skip("has no light factors")
+    transport, brdf = dynamic_system.transport, dynamic_system.brdf
+    turned = eqx.tree_at(lambda table: table.light_map, brdf, jnp.asarray(np.asarray(brdf.light_map)[::-1]))
     with pytest.raises(ValueError, match="light factors differ"):
-        dynamic.DynamicSystem(transport, other)
-    with pytest.raises(ValueError, match="must have the transport's 4 light factors, got 0"):
+        dynamic.DynamicSystem(transport, turned)
+    with pytest.raises(ValueError, match=r"must have the transport's \d+ light factors, got 0"):
         dynamic.DynamicSystem(transport, dynamic.table.without_tensor(METALLIC_ROUGHNESS.lobes()))

@@ -2,7 +2,6 @@
 
 import functools
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -187,28 +186,6 @@ def test_gradients_of_an_isotropic_table_are_those_of_finite_differences_at_the_
         np.testing.assert_allclose(gradient, numeric, rtol=1e-6)
 
 
-def test_an_isotropic_table_turns_with_the_view(tables, random, close):
-    table, angle = tables("sharp"), 0.7
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
-    wi, wo = upper(random, 40), upper(random, 40, least=0.1)
-    turned = value(table, *((each @ turn.T).astype(np.float32) for each in (wi, wo)))
-    close(turned, value(table, wi, wo), tolerance=LOOKUP)
-
-
-def test_one_coefficient_agrees_with_scipys_adaptive_quadrature():
-    brdf, view = Phong(diffuse=0.2, specular=0.6, exponent=8.0), np.array([0.48, -0.6, 0.64])
-
-    def integrand(angle, height):
-        radius = np.sqrt(1 - height**2)
-        wi = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
-        lobe = max(wi @ (view * [-1, -1, 1]), 0) ** 8
-        return (0.2 / np.pi + 0.6 * 10 / (2 * np.pi) * lobe) * height * np.sqrt(15 / (4 * np.pi)) * wi[0] * wi[2]
-
-    expected, _ = scipy.integrate.dblquad(integrand, 0, 1, 0, 2 * np.pi, epsabs=1e-7)
-    actual = project(brdf, np.float32(view[None]), degree=2, rings=24, sectors=96)[7, 0, 0]
-    np.testing.assert_allclose(actual, expected, rtol=1e-4)
-
-
 def test_an_error_that_no_rule_reaches_is_told():
     mirror = CookTorrance(diffuse=0.0, specular=1.0, roughness=0.001)
     with pytest.warns(UserWarning, match="the BRDF is too sharp for the finest quadrature"):
@@ -234,12 +211,11 @@ def test_views_below_the_horizon_and_on_it_see_nothing_and_gradients_are_finite(
     assert np.isfinite(np.asarray(gradient)).all()
 
 
-@pytest.mark.parametrize("shape", [(), (7,), (2, 3), (0,)])
-def test_values_are_the_sum_of_coefficients_times_harmonics_for_any_batch(table, random, close, shape):
-    wi, wo = upper(random, *shape), upper(random, *shape, least=0.1)
+def test_values_are_the_sum_of_coefficients_times_harmonics_for_any_batch(table, random, close):
+    wi, wo = upper(random, 2, 3), upper(random, 2, 3, least=0.1)
     found = np.asarray(value(table, wi, wo))
-    assert found.shape == (*shape, 3)
-    wi, wo = (np.resize(each, (7, 3)) for each in (wi, wo))
+    assert found.shape == (2, 3, 3)
+    wi, wo = (each.reshape(6, 3) for each in (wi, wo))
     row, basis = np.asarray(looked_up(table, wo)), np.asarray(harmonics.evaluate(wi, degree=4))
     expected = [row[:, :, n].T @ basis[n] for n in range(found.size // 3)]
     close(found.reshape(-1, 3), np.reshape(expected, (-1, 3)))
@@ -248,15 +224,18 @@ def test_values_are_the_sum_of_coefficients_times_harmonics_for_any_batch(table,
 def test_more_bands_carry_more_of_the_brdf(tables, random):
     table = tables("glossy")
     texel = np.asarray(hemisphere.parabolic_texel_direction(resolution=RESOLUTION))[4:12, 4:12].reshape(-1, 3)
-    wo = np.repeat(texel, 100, 0)
+    wo = np.repeat(texel, 20, 0)
     wi = upper(random, len(wo))
     exact = value(SHARPNESS["glossy"], wi, wo) * wi[:, 2:]
-    error = [np.linalg.norm(value(table.truncate(degree=n), wi, wo) - exact) / np.linalg.norm(exact) for n in range(5)]
-    assert (np.diff(error) < -0.05).all()
+    error = [np.linalg.norm(value(table.truncate(degree=n), wi, wo) - exact) / np.linalg.norm(exact) for n in (0, 2, 4)]
+    assert (np.diff(error) < -0.1).all()
     assert table.truncate(degree=2).degree == 2
     np.testing.assert_array_equal(table.truncate(degree=2).table, table.table[:9])
     assert np.isnan(table.truncate(degree=2).error)
     assert table.truncate(degree=4).error == table.error
+    for degree in (-1, 5):
+        with pytest.raises(ValueError, match=f"degree must be between 0 and the table's 4, got {degree}"):
+            table.truncate(degree=degree)
 
 
 @pytest.fixture(scope="module")
@@ -273,11 +252,10 @@ def test_knots_have_the_tables_of_their_brdfs(varying, close):
     assert varying.table.shape == (4, 1, 3, 2, 6)
     view = np.float32([[0.2, -0.3, 0.93], [0.6, 0, 0.8]])
     for i, exponent in ((0, 2.0), (2, 20.0)):
-        for j, specular in enumerate((0.0, 0.6)):
-            single = tabulate(Phong(diffuse=0.3, specular=specular, exponent=exponent), degree=1, resolution=6)
-            close(np.asarray(varying.table)[:, :, i, j], single.table, tolerance=2e-3)  # Each has a rule of its own.
-            parameter = np.full(2, exponent, np.float32), np.full(2, specular, np.float32)
-            close(looked_up(varying, view, *parameter), looked_up(single, view), tolerance=2e-3)
+        single = tabulate(Phong(diffuse=0.3, specular=0.6, exponent=exponent), degree=1, resolution=6)
+        close(np.asarray(varying.table)[:, :, i, 1], single.table, tolerance=2e-3)  # Each has a rule of its own.
+        parameter = np.full(2, exponent, np.float32), np.full(2, 0.6, np.float32)
+        close(looked_up(varying, view, *parameter), looked_up(single, view), tolerance=2e-3)
 
 
 def test_parameters_interpolate_linearly_and_clamp_to_their_knots(varying, random, close):
@@ -307,67 +285,9 @@ def test_parameters_interpolate_linearly_and_clamp_to_their_knots(varying, rando
     close(looked_up(varying, view, exponent, specular), expected)
 
 
-def test_gray_and_colored_brdfs_of_one_table_share_its_colors():
-    def made(place):
-        return Lambert(0.5) if place < 0.5 else Lambert([0.5, 0.25, 0.1])
-
-    table = tabulate(made, degree=0, resolution=4, knot=(np.array([0.0, 1.0]),))
-    assert table.table.shape == (1, 3, 2, 4)
-    row = np.asarray(table.table)[0, :, :, 2]
-    np.testing.assert_allclose(row[:, 0], 0.5 / np.sqrt(np.pi) / 2 * np.ones(3), rtol=1e-3)
-    np.testing.assert_allclose(row[:, 1], np.array([0.5, 0.25, 0.1]) / np.sqrt(np.pi) / 2, rtol=1e-3)
-
-
-@pytest.mark.parametrize(
-    "options", [{"degree": -1}, {"degree": 51}, {"resolution": 1}, {"error": 0.0}, {"error": float("nan")}]
-)
-def test_options_out_of_range_are_refused(options):
-    with pytest.raises(
-        ValueError,
-        match=r"degree of 0 to 50, a resolution of at least 2 and an error above 0, got|error must be finite, got nan",
-    ):
-        tabulate(Lambert(), **options)
-
-
-@pytest.mark.parametrize("knot", [[1.0], [1.0, 1.0], [2.0, 1.0], [0.0, np.nan], [0.0, np.inf], [[0.0, 1.0]]])
-def test_knots_that_do_not_increase_are_refused(knot):
-    with pytest.raises(ValueError, match="knots of parameter 1 must be at least two finite increasing numbers, got"):
-        tabulate(lambda a, b: Lambert(a), knot=(np.array([0.0, 1.0]), np.array(knot)))
-
-
-def test_three_parameters_are_refused():
-    with pytest.raises(ValueError, match="at most two parameters can be tabulated, got 3"):
-        tabulate(lambda a, b, c: Lambert(a), knot=(np.array([0.0, 1.0]),) * 3)
-
-
 def test_a_wrong_number_of_parameters_is_refused(table, varying):
     view = jnp.array([[0.0, 0, 1]])
     with pytest.raises(ValueError, match="the table needs 0 parameters, got 1"):
         table.coefficients(view, jnp.ones(1))
     with pytest.raises(ValueError, match="the table needs 2 parameters, got 0"):
         varying.coefficients(view)
-
-
-def test_brdfs_that_are_not_finite_are_refused():
-    broken = eqx.tree_at(lambda brdf: brdf.albedo, Lambert(0.5), jnp.array([jnp.nan]))
-    with pytest.raises(ValueError, match="must be finite for all directions above the horizon"):
-        tabulate(broken, degree=0, resolution=2)
-    with pytest.raises(ValueError, match=r"got NaN or infinity at parameters \(.*2\.0.*\)"):
-        tabulate(lambda a: Lambert(0.5) if a < 1.5 else broken, degree=0, resolution=2, knot=(np.arange(3.0),))
-
-
-def test_brdfs_without_an_axis_of_colors_are_refused():
-    with pytest.raises(ValueError, match=r"the BRDF must return \[\d+, c\] for \d+ directions, got \[\d+\]"):
-        tabulate(lambda wi, wo: wi[:, 2], degree=0, resolution=2)
-
-
-@pytest.mark.parametrize("degree", [-1, 5])
-def test_bands_that_are_not_there_are_refused(table, degree):
-    with pytest.raises(ValueError, match=f"degree must be between 0 and the table's 4, got {degree}"):
-        table.truncate(degree=degree)
-
-
-def test_a_table_whose_rows_are_no_square_is_refused(random):
-    broken = HarmonicBrdf(jnp.zeros((8, 1, 4, 4)), (), jnp.zeros(()))
-    with pytest.raises(ValueError, match="must be a square number, got 8"):
-        value(broken, upper(random, 2), upper(random, 2))

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import scipy
 
-from jaxprt import lobe, visibility
+from jaxprt import lobe
 from jaxprt.decompose import mixture
 from jaxprt.scene import builtin
-from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.sphere import cubemap
+from tests.systems.scenes import SIZE, ball_on_ground, pyramids_on_ground, seen_on_ground
 
-SIZE = 16
 BYTE = 2e-3  # half a step of a byte
 SLOPE = 5e-3  # change of slopes over 1e-5, in visibility per radian
 # A pyramid's boxes and tents are no normal distribution: at most .047 was measured, root mean square.
@@ -20,20 +19,13 @@ FRACTION = 0.06
 
 
 @pytest.fixture(scope="module")
-def visible():
-    """A ball over the ground: vertices with contact shadows, and ground vertices near them."""
-    ball = builtin.sphere(rings=8, sectors=10)
-    return visibility.precompute(join([ball, ground_plane(ball, vertices=36)]), size=SIZE)
+def compressed():
+    return pyramids_on_ground()
 
 
 @pytest.fixture(scope="module")
-def compressed(visible):
-    return lobe.compress(visible)
-
-
-@pytest.fixture(scope="module")
-def seen(visible):
-    return visible.seen(np.arange(len(visible.position)))
+def seen():
+    return seen_on_ground().seen(np.arange(len(ball_on_ground().position)))
 
 
 @jax.jit
@@ -45,7 +37,7 @@ def read(transport, direction, spread):
     """Shares of one lobe in the same world direction for all vertices."""
     count = len(transport.position)
     place = np.broadcast_to(np.float32(direction)[:, None, None], (3, 1, count))
-    return look(transport, *cubemap.project(*map(jnp.asarray, place)), np.full((1, count), spread, np.float32))
+    return look(transport, *cubemap.project(*place), np.full((1, count), spread, np.float32))
 
 
 def exact(seen, direction, spread):
@@ -59,6 +51,7 @@ def exact(seen, direction, spread):
 
 
 def test_every_texel_is_its_own_bit(seen):
+    assert lobe.pyramid.scales(64).total <= 6000  # bytes
     pyramid = lobe.pyramid.pyramid(jnp.asarray(seen))
     blank = lobe.LobeTransport(
         pyramid, jnp.zeros((0, len(seen)), jnp.uint8), jnp.zeros((len(seen), 3)), jnp.zeros((len(seen), 3, 3)), SIZE
@@ -68,19 +61,15 @@ def test_every_texel_is_its_own_bit(seen):
         np.testing.assert_array_equal(np.asarray(each.visible(every)), (seen >= 8).T)
 
 
-def test_a_pyramid_takes_six_kilobytes():
-    assert lobe.pyramid.scales(64).total <= 6000
-
-
 @pytest.mark.parametrize("value", [0, 16])
 def test_what_is_open_or_closed_all_around_is_so_at_all_scales(value):
     pyramid = lobe.pyramid.pyramid(jnp.full((2, 6 * SIZE**2), value, jnp.uint8))
     transport = lobe.LobeTransport(pyramid, jnp.zeros((0, 2), jnp.uint8), jnp.zeros((2, 3)), jnp.zeros((2, 3, 3)), SIZE)
-    for spread in (1e-5, 1e-3, 0.01, 0.1, 0.5, 0.99):
-        for direction in ([1, 0, 0], [0.5, -0.5, 0.7], [1, 1, 1], [1, 1, 0.01]):
+    for spread in (1e-5, 0.01, 0.1, 0.99):
+        for direction in ([1, 0, 0], [0.5, -0.5, 0.7], [1, 1, 1]):
             visible, by_s, by_t = read(transport, direction, spread)
             np.testing.assert_allclose(visible, value / 16, atol=1e-6)
-            np.testing.assert_allclose(jnp.stack([by_s, by_t]), 0, atol=1e-4)
+            np.testing.assert_allclose([by_s, by_t], 0, atol=1e-4)
 
 
 @pytest.mark.parametrize("spread", [3e-3, 0.01, 0.03, 0.1, 0.3])
@@ -108,44 +97,20 @@ def test_visible_parts_at_a_scale_of_bytes_are_its_means_weighted_by_splines(com
         np.testing.assert_allclose(visible[0], np.einsum("i,vij,j->v", spline, around, spline), atol=BYTE + 1e-5)
 
 
-def test_slopes_are_those_of_the_visible_parts(compressed):
-    count, step = len(compressed.position), 1e-3
-    random = np.random.default_rng(1)
-    face = jnp.asarray(random.integers(6, size=(3, count)))
-    s, t = (jnp.asarray(random.uniform(-0.9, 0.9, (3, count)), jnp.float32) for _ in range(2))
-    spread = jnp.asarray(random.uniform(0.02, 0.04, (3, count)), jnp.float32)
-    _, by_s, by_t = look(compressed, face, s, t, spread)
-    along_s = (look(compressed, face, s + step, t, spread)[0] - look(compressed, face, s - step, t, spread)[0]) / (
-        2 * step
-    )
-    along_t = (look(compressed, face, s, t + step, spread)[0] - look(compressed, face, s, t - step, spread)[0]) / (
-        2 * step
-    )
-    inside = (np.abs(s) < 0.4) & (np.abs(t) < 0.4)  # beyond, slopes blend over to the neighboring face
-    for slope, difference in ((by_s, along_s), (by_t, along_t)):
-        np.testing.assert_allclose(np.asarray(slope)[inside], np.asarray(difference)[inside], atol=5e-3)
-
-
 def test_slopes_are_what_differentiation_gives(compressed):
-    face, s, t = cubemap.project(*(jnp.full((1, len(compressed.position)), x) for x in (0.3, 0.9, 0.2)))
-    spread = jnp.full(s.shape, 0.03)
+    shape = 1, len(compressed.position)
+    face, s, t = cubemap.project(*(np.full(shape, x, np.float32) for x in (0.3, 0.9, 0.2)))
+    spread = np.full(shape, 0.03, np.float32)
     _, by_s, by_t = look(compressed, face, s, t, spread)
-    gradient = jax.grad(lambda s, t: jnp.sum(look(compressed, face, s, t, spread)[0]), argnums=(0, 1))(s, t)
+    slope = jax.jit(jax.grad(lambda s, t: jnp.sum(look(compressed, face, s, t, spread)[0]), argnums=(0, 1)))
+    gradient = slope(s, t)
     np.testing.assert_allclose(gradient[0], by_s, atol=1e-5)
     np.testing.assert_allclose(gradient[1], by_t, atol=1e-5)
 
 
-def test_visible_parts_are_continuous_over_the_edges_of_the_cube(compressed):
-    """At scales of bytes, whose faces have a rim; bits end at the edge."""
-    for spread in (0.05, 0.2):
-        for one, other in (([1, 0.3, 0.99999], [0.99999, 0.3, 1]), ([-0.2, 1, 0.99999], [-0.2, 0.99999, 1])):
-            first, second = (np.asarray(read(compressed, x, spread)[0]) for x in (one, other))
-            np.testing.assert_allclose(first, second, atol=2e-3)
-
-
 def gradient(transport, direction, spread):
     """Gradient on the sphere of the visible part of a lobe, for all vertices."""
-    face, s, t = (float(x) for x in cubemap.project(*(jnp.asarray(float(x)) for x in direction)))
+    face, s, t = (float(x) for x in cubemap.project(*np.float32(direction)))
     _, by_s, by_t = (np.asarray(x, np.float64)[0] for x in read(transport, direction, spread))
     ways = by_s * (1 + s * s) + by_t * s * t, by_t * (1 + t * t) + by_s * s * t
     first, second, normal = cubemap.axes()[int(face)]
@@ -154,7 +119,7 @@ def gradient(transport, direction, spread):
     return np.linalg.norm(point) * (moved - point * (moved @ point)[:, None] / (point @ point))
 
 
-def test_slopes_are_continuous_between_texels_and_over_the_edges_of_the_cube(compressed):
+def test_visible_parts_and_their_slopes_are_continuous_between_texels_and_over_the_edges_of_the_cube(compressed):
     """At scales of bytes: a step of 1e-5 changes them by as much, where slopes of bilinear look-up jump."""
     for spread in (0.05, 0.2):
         for one, other in (
@@ -163,13 +128,16 @@ def test_slopes_are_continuous_between_texels_and_over_the_edges_of_the_cube(com
             ([1, 0.499995, 0.2], [1, 0.500005, 0.2]),  # between texels of 4 x 4 a face
             ([1, -0.249995, 0.2], [1, -0.250005, 0.2]),  # at the center of one
         ):
+            first, second = (np.asarray(read(compressed, x, spread)[0]) for x in (one, other))
+            np.testing.assert_allclose(first, second, atol=2e-3)
             first, second = (gradient(compressed, x, spread) for x in (one, other))
             np.testing.assert_allclose(first, second, atol=SLOPE)
 
 
 def test_tracing_gives_what_compressing_known_visibility_gives(compressed):
-    ball = builtin.sphere(rings=8, sectors=10)
-    scene = join([ball, ground_plane(ball, vertices=36)])
+    with pytest.raises(ValueError, match="size must be a power of two, at least 8, got 4"):
+        lobe.precompute(builtin.sphere(rings=4, sectors=5), size=4)
+    scene = ball_on_ground()
     chosen = np.arange(0, len(scene.position), 7)
     traced = lobe.precompute(scene, size=SIZE, vertex=chosen)
     # Known visibility is in four bits, in which 9 sixteenths are 8.
@@ -179,12 +147,6 @@ def test_tracing_gives_what_compressing_known_visibility_gives(compressed):
         <= 2
     )
     assert np.max(np.abs(np.asarray(traced.vector).astype(int) - np.asarray(compressed.vector)[:, chosen])) <= 8
-
-
-@pytest.mark.parametrize("size", [4])
-def test_other_sizes_are_refused(size):
-    with pytest.raises(ValueError, match=rf"size must be a power of two, at least 8, got {size}"):
-        lobe.precompute(builtin.sphere(rings=4, sectors=5), size=size)
 
 
 def test_the_mean_of_the_seen_part_does_not_depend_on_the_face_of_the_lobe():

@@ -5,16 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt import bright_texels, lobe, total, visibility
+from jaxprt import bright_texels, lobe, total
 from jaxprt.brdf import CookTorrance
 from jaxprt.scene import Environment, builtin
-from jaxprt.scene.mesh import ground_plane, join
 from jaxprt.scene.points import VERTICES, Points
 from jaxprt.systems.lobe import widened
 from jaxprt.systems.lobe.table import LobeMixture
+from tests.systems.scenes import SIZE, ball_on_ground, pyramids_on_ground, seen_on_ground
 
 pytestmark = pytest.mark.usefixtures("few_samples")
-SIZE = 16
 EYE = jnp.array([1.2, 1.5, 2.5])
 BRDF = CookTorrance(diffuse=[0.3, 0.2, 0.1], roughness=0.2)
 LOBES = 0.03  # of all radiance: what lobes change of the BRDF of the brightest texels, and a texel's width as a lobe
@@ -23,14 +22,8 @@ ENERGY = 0.04  # of all radiance in white light: what falls below the horizon or
 
 
 @pytest.fixture(scope="module")
-def mesh():
-    ball = builtin.sphere(rings=8, sectors=10)
-    return join([ball, ground_plane(ball, vertices=36)])
-
-
-@pytest.fixture(scope="module")
-def seen(mesh):
-    return visibility.precompute(mesh, size=SIZE)
+def seen():
+    return seen_on_ground()
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +33,7 @@ def systems(seen):
 
 def both(seen, brdf):
     """The lobe system alone, and with the brightest texels apart."""
-    plain = lobe.LobeSystem(lobe.compress(seen), lobe.tabulate(brdf, lobes=6, resolution=16))
+    plain = lobe.LobeSystem(pyramids_on_ground(), lobe.tabulate(brdf, lobes=6, resolution=16))
     return plain, bright_texels.BrightTexels(plain, seen, brdf, count=8, samples=2)
 
 
@@ -82,12 +75,13 @@ def test_widening_keeps_energy_and_makes_highlights_wide(seen):
         assert np.all(np.isfinite(widest))
 
 
-def test_points_have_what_vertices_have(mesh, systems, close):
+def test_points_have_what_vertices_have(systems, close):
     system, light = systems[1], builtin.daylight(size=SIZE)
-    corner = mesh.face[::7].T
-    weight = jnp.zeros(corner.shape).at[0].set(1)
-    points = Points(corner, weight, jnp.zeros((2, *corner.shape)))
-    close(lit(system, light, 0.1, points), lit(system, light, 0.1)[np.asarray(corner[0])], tolerance=1e-4)
+    corner = np.asarray(ball_on_ground().face)[::7].T
+    weight = np.zeros(corner.shape, np.float32)
+    weight[0] = 1
+    points = Points(*map(jnp.asarray, (corner, weight, np.zeros((2, *corner.shape), np.float32))))
+    close(lit(system, light, 0.1, points), lit(system, light, 0.1)[corner[0]], tolerance=1e-4)
 
 
 def test_only_systems_with_lobes_can_be_widened(systems):

@@ -1,6 +1,7 @@
 """The separable system: degenerate input gives finite, bounded radiance."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import jaxprt as prt
 from jaxprt import bright_texels, reference, separable
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.scene import Environment, builtin
-from jaxprt.scene.mesh import join, make_mesh
+from jaxprt.scene.mesh import join
 from jaxprt.sphere import directions
 from jaxprt.systems.separable import SeparableBrdf, factor, precompute
 from jaxprt.systems.separable.sparse import project
@@ -31,11 +32,6 @@ def lambert():
 
 
 @pytest.fixture(scope="module")
-def glossy():
-    return factor(AshikhminShirley(diffuse=0.3, specular=0.5, nu=20, nv=80), terms=4, resolution=12)
-
-
-@pytest.fixture(scope="module")
 def light():
     return builtin.daylight(size=SIZE)
 
@@ -45,7 +41,8 @@ def sphere():
 
 
 def moved(mesh, *, scale=1.0, shift=0.0):
-    return eqx.tree_at(lambda m: m.position, mesh, mesh.position * scale + jnp.asarray(shift, jnp.float32))
+    position = np.asarray(mesh.position) * np.float32(scale) + np.float32(shift)
+    return eqx.tree_at(lambda m: m.position, mesh, jax.device_put(position))
 
 
 def repeated(mesh, vertex):
@@ -79,11 +76,12 @@ def known_error(mesh, color, light, *, albedo=(0.8, 0.5, 0.2), keep=24, eye=EYE,
 
 def sun(strength):
     """Half of the light, or so, in one texel."""
-    radiance = jnp.ones((6, SIZE, SIZE, 3))
-    return Environment(radiance.at[2, 3, 4].set(strength))
+    radiance = np.ones((6, SIZE, SIZE, 3), np.float32)
+    radiance[2, 3, 4] = strength
+    return Environment(jax.device_put(radiance))
 
 
-@pytest.mark.parametrize("strength", [384.0, 1e6, 1e30])
+@pytest.mark.parametrize("strength", [384.0, 1e30])
 def test_a_sun_in_one_texel_is_that_of_the_reference(lambert, strength):
     mesh, light = sphere(), sun(strength)
     color = relight(mesh, lambert, light, keep=ALL)
@@ -91,59 +89,11 @@ def test_a_sun_in_one_texel_is_that_of_the_reference(lambert, strength):
     np.testing.assert_allclose(color / strength, exact / strength, atol=1e-5)
 
 
-@pytest.mark.parametrize("exponents", [(1, 1), (1000, 1000), (10000, 10000), (0, 0), (1, 10000)])
-def test_dull_and_sharp_brdfs_give_finite_radiance(light, exponents):
-    brdf = AshikhminShirley(diffuse=0.3, specular=0.5, nu=exponents[0], nv=exponents[1])
-    color = relight(sphere(), factor(brdf, terms=4, resolution=12), light)
-    assert color.any()
-    exact = exact_radiance(sphere(), brdf, light, error=0.01)
-    assert np.isfinite(exact).all()
-    assert (exact >= 0).all()
-
-
-def test_all_coefficients_equal_the_reference_and_one_is_finite(lambert, light):
-    mesh = sphere()
-    assert known_error(mesh, relight(mesh, lambert, light, keep=ALL), light) < EXACT
-    assert known_error(mesh, relight(mesh, lambert, light, keep=1), light) < 1.5
-
-
 def test_the_error_falls_as_more_is_kept(lambert, light):
     mesh = join([sphere(), moved(builtin.plane(cells=3), scale=2.0, shift=[0, -1.2, 0])])
-    error = [known_error(mesh, relight(mesh, lambert, light, keep=keep), light) for keep in (4, 24, 96, ALL)]
-    assert error[0] > error[1] > error[2] > error[3]
-    assert error[3] < EXACT
-
-
-def test_a_flat_plane_is_lit_evenly(lambert, light):
-    color = relight(builtin.plane(cells=4), lambert, light)
-    np.testing.assert_allclose(color, np.broadcast_to(color[0], color.shape), rtol=1e-5)
-
-
-def test_the_two_sides_of_a_sheet_are_lit_by_their_own_halves(lambert, light, close):
-    up = builtin.plane(cells=2)
-    down = make_mesh(np.asarray(up.position), np.asarray(up.face)[:, ::-1], normal=-np.asarray(up.normal))
-    sheet = join([up, down])
-    for eye, part in ((EYE, slice(0, 9)), (-EYE, slice(9, 18))):
-        color = relight(sheet, lambert, light, eye=eye)
-        alone = relight(up if eye is EYE else down, lambert, light, eye=eye)
-        close(color[part], alone, tolerance=EXACT)
-
-
-@pytest.mark.parametrize("scale", [1e-12, 1e-3, 1e3, 1e12])
-def test_size_does_not_matter(lambert, light, close, scale):
-    mesh = join([sphere(), moved(builtin.plane(cells=3), scale=2.0, shift=[0, -1.2, 0])])
-    expected = relight(mesh, lambert, light, keep=ALL)
-    # Rays that pass an edge closer than float32 tells may fall on its other side: a sixteenth of a few texels.
-    close(relight(moved(mesh, scale=scale), lambert, light, keep=ALL, eye=EYE * scale), expected, tolerance=0.01)
-
-
-def test_what_touches_the_ground_is_not_lit_from_beneath(lambert):
-    below = Environment(jnp.zeros((6, SIZE, SIZE, 3)).at[3].set(1))
-    ball = moved(sphere(), shift=[0, 1, 0])
-    mesh = join([ball, moved(builtin.plane(cells=21), scale=21.0)])
-    near = np.flatnonzero(np.abs(np.asarray(mesh.position)).max(1) < 3)
-    assert not relight(mesh, lambert, below, vertex=near, eye=jnp.array([0.0, -5, 1])).any()
-    assert not relight(mesh, lambert, below, vertex=near).any()
+    error = [known_error(mesh, relight(mesh, lambert, light, keep=keep), light) for keep in (1, 24, ALL)]
+    assert error[0] > error[1] > error[2]
+    assert error[2] < EXACT
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +137,7 @@ def blind(seen, vertex):
     return dark
 
 
-@pytest.mark.parametrize("exponents", [(0, 0), (1, 1000), (1000, 1), (1000, 1000)])
+@pytest.mark.parametrize("exponents", [(0, 0), (1, 1000)])
 def test_clusters_hold_dull_sharp_and_brushed_brdfs(seen, light, close, exponents):
     brdf = AshikhminShirley(diffuse=[0.3, 0.2, 0.1], specular=0.5, nu=exponents[0], nv=exponents[1])
     factored = factor(brdf, terms=3, resolution=12)
@@ -196,30 +146,20 @@ def test_clusters_hold_dull_sharp_and_brushed_brdfs(seen, light, close, exponent
     assert expected.any()
 
 
-def test_clusters_hold_more_terms_than_the_brdf_has(seen, light, close):
-    brdf = Lambert([0.8, 0.5, 0.2])
-    close(
-        clustered_radiance(seen, factor(brdf, terms=3, resolution=12), light),
-        all_texels(seen, brdf, light),
-        tolerance=HALF,
+def test_clusters_of_one_vertex_are_that_vertex(seen, light, close):
+    count, glossy = (
+        len(seen.position),
+        factor(AshikhminShirley(diffuse=0.3, specular=0.5, nu=20), terms=3, resolution=12),
     )
-
-
-def test_clusters_of_a_black_brdf_are_black(seen, light):
-    assert not clustered_radiance(seen, factor(Lambert([0.0, 0, 0]), terms=3, resolution=12), light).any()
-
-
-def test_clusters_of_one_vertex_are_that_vertex(seen, glossy, light, close):
-    count = len(seen.position)
-    color = clustered_radiance(seen, glossy, light, clusters=count, components=1, modes=4)
+    color = clustered_radiance(seen, glossy, light, clusters=count, components=1, modes=3)
     close(color, all_texels(seen, glossy, light), tolerance=HALF)
 
 
-@pytest.mark.parametrize("which", ["one vertex", "a cluster", "all"])
+@pytest.mark.parametrize("which", ["one vertex", "a cluster"])
 def test_vertices_that_see_nothing_are_black_and_the_others_as_they_were(seen, light, close, which):
     brdf = factor(AshikhminShirley(diffuse=[0.3, 0.2, 0.1], specular=0.5), terms=3, resolution=12)
     member = members.cluster(seen.position, seen.frame[:, 2], clusters=4)
-    vertex = {"one vertex": member[1, :1], "a cluster": member[1], "all": np.arange(len(seen.position))}[which]
+    vertex = {"one vertex": member[1, :1], "a cluster": member[1]}[which]
     color = clustered_radiance(blind(seen, vertex), brdf, light)
     expected = all_texels(seen, brdf, light).copy()
     expected[vertex] = 0
@@ -228,9 +168,8 @@ def test_vertices_that_see_nothing_are_black_and_the_others_as_they_were(seen, l
         assert not color[vertex].any()
 
 
-@pytest.mark.parametrize("strength", [384.0, 1e6])
-def test_a_sun_by_its_texel_and_the_rest_by_clusters_are_the_reference(seen, close, strength):
-    brdf, light = Lambert([0.8, 0.5, 0.2]), sun(strength)
+def test_a_sun_by_its_texel_and_the_rest_by_clusters_are_the_reference(seen, close):
+    brdf, light = Lambert([0.8, 0.5, 0.2]), sun(1e6)
     texel, excess, rest = bright_texels.split(light, count=1)
     assert np.asarray(rest.radiance).max() < 3
     bright = np.asarray(bright_texels.radiance(seen, brdf, texel, excess, eye=EYE))
@@ -241,40 +180,12 @@ def test_a_sun_by_its_texel_and_the_rest_by_clusters_are_the_reference(seen, clo
     assert bright.any()
 
 
-AWKWARD = [
-    "bunny_vrip_res2.ply",
-    "busted.STL",
-    "chair_model.obj",
-    "cube_blender_uv.ply",
-    "cycloidal.ply",
-    "dragon_vrip_res3.ply",
-    "featuretype.STL",
-    "fuze.obj",
-    "joined_tetrahedra.obj",
-    "nancolor.obj",
-    "negative_indices.obj",
-    "polygonfaces.obj",
-    "quadknot.obj",
-    "rabbit.obj",
-    "singlevn.obj",
-    "soup.stl",
-    "suzanne_facets.ply",
-    "tube.obj",
-]
-
-
-def test_every_awkward_mesh_is_in_the_list(data):
-    found = {path.name for path in (data / "meshes_awkward").iterdir() if path.suffix != ".mtl"}
-    assert found == {*AWKWARD, "empty.obj"}
-
-
-def test_an_empty_mesh_is_refused_before_anything_is_computed(data):
-    with pytest.raises(ValueError, match=r"empty\.obj must hold vertices and faces"):
-        prt.scene.load_mesh(data / "meshes_awkward" / "empty.obj")
+# Holes, colors of NaN, indices from the end, polygons, one normal for many vertices, triangles alone.
+AWKWARD = ["busted.STL", "nancolor.obj", "negative_indices.obj", "polygonfaces.obj", "singlevn.obj", "soup.stl"]
 
 
 @pytest.mark.parametrize("name", AWKWARD)
-def test_awkward_meshes_are_lit_like_the_reference(data, lambert, glossy, light, name):
+def test_awkward_meshes_are_lit_like_the_reference(data, lambert, light, name):
     mesh = prt.scene.load_mesh(data / "meshes_awkward" / name)
     count = len(mesh.position)
     # One number of vertices for all, so that they are compiled once.
@@ -285,4 +196,3 @@ def test_awkward_meshes_are_lit_like_the_reference(data, lambert, glossy, light,
     error = known_error(mesh, color, light, eye=eye, vertex=vertex)
     assert error < HORIZON
     assert color.any()
-    relight(mesh, glossy, light, eye=eye, vertex=vertex)
