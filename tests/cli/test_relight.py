@@ -16,7 +16,7 @@ import jaxprt as prt
 from jaxprt.cli import report as cli_report
 
 SYSTEMS = ("separable", "harmonic", "lobe")
-WHOLE = ("--ground", "--azimuth", "-30", "--system", ",".join(SYSTEMS), "--layers", "color,alpha,depth")
+PLAIN = ("--ground", "--azimuth", "-30", "--system", "separable")
 
 
 @pytest.fixture(scope="module")
@@ -54,104 +54,70 @@ def report(output):
 
 
 @pytest.fixture(scope="module")
-def output(run, tmp_path_factory):
-    """What one whole run leaves: two lights, a coarse ground, all systems."""
-    folder = tmp_path_factory.mktemp("relight") / "deep" / "whole"
-    assert run(*WHOLE, sky=("sky.exr", "dusk.exr"), output=folder) == 0
+def plain(run, tmp_path_factory):
+    """What a run of one system leaves, of a matte mesh on a coarse ground."""
+    folder = tmp_path_factory.mktemp("relight") / "deep" / "plain"
+    assert run(*PLAIN, output=folder) == 0
     return folder
 
 
-def test_pictures_and_report_are_written(output):
-    kinds = ["reference", *SYSTEMS, *(f"{system}_difference" for system in SYSTEMS)]
-    names = [f"{light}_{kind}" for light in ("sky", "dusk") for kind in kinds]
-    expected = {f"{name}.{suffix}" for name in names for suffix in ("exr", "png")} | {"sky.png", "dusk.png"}
-    expected |= {f"{light}_{system}_layers.exr" for light in ("sky", "dusk") for system in SYSTEMS}
-    assert {path.name for path in output.iterdir()} == expected | set(SYSTEMS) | {"report.json"}
-    for name in expected:
-        assert (output / name).stat().st_size > 50
-    picture, _ = prt.files.read_image(output / "sky_harmonic.exr")
-    assert picture.shape == (32, 32, 3)
-    assert np.isfinite(picture).all()
-    whole = OpenImageIO.ImageInput.open(str(output / "sky_harmonic_layers.exr"))
-    assert whole is not None
-    assert list(whole.spec().channelnames) == ["R", "G", "B", "A", "Z"]
-    layers = np.asarray(whole.read_image("float"))
-    seen = layers[..., 3] == 1
-    assert seen.any()
-    np.testing.assert_allclose(layers[seen][:, :3], picture[seen], rtol=1e-4, atol=1e-5)
-
-
-def test_the_systems_stand_side_by_side_before_the_reference(output):
-    row, _ = prt.files.read_image(output / "sky.png")
-    parts = [prt.files.read_image(output / f"sky_{kind}.png")[0] for kind in (*SYSTEMS, "reference")]
-    np.testing.assert_array_equal(row, np.concatenate(parts, 1))
-
-
-def test_the_report_is_json_of_finite_numbers(output):
-    told = report(output)
-    assert told["vertices"] == {"mesh": 4, "ground": 49}
-    assert set(told["lights"]) == {"sky", "dusk"}
-    for light in told["lights"].values():
-        for system in SYSTEMS:
-            assert 0 < light[system]["picture_error"] < 0.5
-            assert 0 < light[system]["picture_error_spread"] < 0.3 * light[system]["picture_error"]
-            assert set(light[system]["vertex_error"]) == {"mesh", "ground"}
-        assert 0 < light["exact_pixels_error"] < 0.2
-        assert 0 < light["exact_picture_error"] < 0.3
-    assert 100 < told["exact"]["pixels"] < 300
-    assert told["exact"]["picture_width"] == 32
-    assert told["exact"]["vertices"] == {"mesh": 4, "ground": 39}
-    assert told["precompute"]["separable"]["mesh"]["keep"] == 8
-    assert told["precompute"]["harmonic"]["mesh"]["degree"] == 4
-    assert told["precompute"]["lobe"]["mesh"]["texels"] == 16
-    assert told["precompute"]["lobe"]["bytes"] > 0
-    assert told["brdf"] == {name: {"model": "Lambert", "albedo": [0.5]} for name in ("mesh", "ground")}
-    assert min(numbers(told["times"])) > 0
-    assert told["peak_bytes"] > 1e7
-
-
-def test_the_report_says_what_was_relit(place, output):
-    told = report(output)
+def test_the_report_says_what_was_relit_and_how_well(place, plain):
+    told = report(plain)
     assert told["meshes"] == [str(place / "mesh.obj")]
     assert told["up"] == "y"
     assert told["ground"] is True
-    assert told["environments"] == {name: str(place / f"{name}.exr") for name in ("sky", "dusk")}
+    assert told["environments"] == {"sky": str(place / "sky.exr")}
+    assert told["vertices"] == {"mesh": 4, "ground": 49}
+    assert told["brdf"] == {name: {"model": "Lambert", "albedo": [0.5]} for name in ("mesh", "ground")}
     camera = told["camera"]
     assert (camera["width"], camera["height"]) == (32, 32)
     offset = np.subtract(camera["eye"], camera["target"])
     np.testing.assert_allclose(np.degrees(np.arctan2(offset[0], offset[2])), -30, atol=1e-3)
+    light = told["lights"]["sky"]
+    assert 0 < light["separable"]["picture_error"] < 0.5
+    assert 0 < light["separable"]["picture_error_spread"] < 0.3 * light["separable"]["picture_error"]
+    assert set(light["separable"]["vertex_error"]) == {"mesh", "ground"}
+    assert 0 < light["exact_pixels_error"] < 0.2
+    assert 0 < light["exact_picture_error"] < 0.3
+    assert 100 < told["exact"]["pixels"] < 300
+    assert told["exact"]["picture_width"] == 32
+    assert told["exact"]["vertices"] == {"mesh": 4, "ground": 39}
+    assert told["precompute"]["separable"]["mesh"]["keep"] == 8
+    assert min(numbers(told["times"])) > 0
+    assert told["peak_bytes"] > 1e7
 
 
-def test_the_pictures_differ_by_what_the_report_says(output):
-    image, reference, difference = (
-        prt.files.read_image(output / f"sky_{kind}.exr")[0] for kind in ("harmonic", "reference", "harmonic_difference")
-    )
+def test_a_picture_stands_before_the_reference_and_differs_from_it_by_the_difference(plain):
+    row, _ = prt.files.read_image(plain / "sky.png")
+    parts = [prt.files.read_image(plain / f"sky_{kind}.png")[0] for kind in ("separable", "reference")]
+    np.testing.assert_array_equal(row, np.concatenate(parts, 1))
+    kinds = ("separable", "reference", "separable_difference")
+    image, reference, difference = (prt.files.read_image(plain / f"sky_{kind}.exr")[0] for kind in kinds)
     np.testing.assert_allclose(np.abs(image - reference), difference, atol=2e-3 * reference.max())
 
 
-def test_a_second_run_takes_the_transport_from_the_first(run, output, tmp_path, capsys):
-    again = shutil.copytree(output, tmp_path / "again")
+def test_a_second_run_takes_the_transport_from_the_first(run, plain, tmp_path, capsys):
+    again = shutil.copytree(plain, tmp_path / "again")
     stored = {path: path.stat().st_mtime_ns for path in again.glob("*/*.prt/**/*") if path.is_file()}
-    options = ("--ground", "--azimuth", "-30", "--system", "separable")
-    assert run(*options, output=again) == 0
+    assert run(*PLAIN, output=again) == 0
     told = capsys.readouterr()
     assert "pictures and report.json are in" in told.out
     assert "error" not in told.err.lower()
     assert stored == {path: path.stat().st_mtime_ns for path in stored}
-    first, second = (report(folder)["lights"]["sky"]["separable"]["vertex_error"] for folder in (output, again))
+    first, second = (report(folder)["lights"]["sky"]["separable"]["vertex_error"] for folder in (plain, again))
     assert second == pytest.approx(first, rel=1e-3)
-    assert run(*options, "--keep", "9", output=again) == 2
+    assert run(*PLAIN, "--keep", "9", output=again) == 2
     words = r"separable.prt holds arrays that were computed from .*keep: stored 8, now 9.* name another --output"
     assert_told(capsys, words)
 
 
 @pytest.fixture(scope="module")
 def glossy(run, place, tmp_path_factory):
-    """What a run of a glossy BRDF leaves, with the error table, under two skies of one name."""
+    """What a run of a glossy BRDF by all systems leaves, with layers and the error table, under two skies of a name."""
     folder = tmp_path_factory.mktemp("glossy")
     (folder / "other").mkdir()
     shutil.copy(place / "dusk.exr", folder / "other" / "sky.exr")
-    options = ["--table", "3", "--terms", "2", "--turn", "90"]
+    options = ["--table", "3", "--terms", "2", "--turn", "90", "--layers", "color,alpha,depth"]
     options += ["--system", ",".join(SYSTEMS), "--order", "4", "--window", "none", "--lobes", "1"]
     options += ["--brdf", "ashikhmin-shirley:diffuse=.2/.3/.4,specular=.1,nu=10"]
     with pytest.MonkeyPatch.context() as patch:
@@ -161,15 +127,34 @@ def glossy(run, place, tmp_path_factory):
     return folder
 
 
-def test_glossy_brdfs_and_the_error_table(glossy):
-    table = report(glossy)["table"]
-    separable, harmonic, lobe = ([row for row in table if row["system"] == system] for system in SYSTEMS)
+def test_all_systems_leave_pictures_layers_and_an_error_table_under_each_sky(place, glossy):
+    skies = {"sky": place / "sky.exr", "sky_2": glossy / "other" / "sky.exr"}
+    kinds = ["reference", *SYSTEMS, *(f"{system}_difference" for system in SYSTEMS)]
+    expected = {f"{sky}_{kind}.{suffix}" for sky in skies for kind in kinds for suffix in ("exr", "png")}
+    expected |= {f"{sky}_{system}_layers.exr" for sky in skies for system in SYSTEMS} | {f"{sky}.png" for sky in skies}
+    assert {path.name for path in glossy.iterdir()} == expected | {*SYSTEMS, "other", "report.json"}
+    first, second = (prt.files.read_image(glossy / f"{sky}_separable.exr")[0] for sky in skies)
+    assert first.shape == (32, 32, 3)
+    assert np.abs(first - second).max() > 0.1
+    file = OpenImageIO.ImageInput.open(str(glossy / "sky_separable_layers.exr"))
+    assert file is not None
+    assert list(file.spec().channelnames) == ["R", "G", "B", "A", "Z"]
+    layers = np.asarray(file.read_image("float"))
+    seen = layers[..., 3] == 1
+    assert seen.any()
+    np.testing.assert_allclose(layers[seen][:, :3], first[seen], rtol=1e-4, atol=1e-5)
+    told = report(glossy)
+    assert told["environments"] == {sky: str(path) for sky, path in skies.items()}
+    assert all(0 < told["lights"][sky][system]["picture_error"] < 2 for sky in skies for system in SYSTEMS)
+    separable, harmonic, lobe = ([row for row in told["table"] if row["system"] == system] for system in SYSTEMS)
     assert {(row["terms"], row["keep"]) for row in separable} == {(t, k) for t in (1, 4) for k in (32, 96)}
     assert {(row["degree"], row["laplacian"]) for row in harmonic} == {(d, w) for d in (1, 3) for w in (1.0, 0.4)}
     assert [(row["lobes"], row["texels"]) for row in lobe] == [(1, 0), (1, 16)]
-    assert all(0 < row[f"error {sky}"] < 2 for row in table for sky in ("sky", "sky_2"))
-    made = report(glossy)["precompute"]
+    assert all(0 < row[f"error {sky}"] < 2 for row in told["table"] for sky in skies)
+    made = told["precompute"]
     assert (made["harmonic"]["mesh"]["degree"], made["lobe"]["mesh"]["lobes"]) == (3, 1)
+    assert made["lobe"]["mesh"]["texels"] == 16
+    assert made["lobe"]["bytes"] > 0
 
 
 def test_the_exact_picture_of_many_points_has_fewer_pixels_and_so_have_differences(glossy):
@@ -220,7 +205,6 @@ def test_bad_files_are_named_on_stderr_with_status_2(run, tmp_path, capsys, opti
         (["--size", "many"], "'--size': must be a whole number from 1 to 8192, got 'many'"),
         (["--keep", "0"], "'--keep': must be a whole number of at least 1, got 0"),
         (["--keep", "30000"], "--keep must be at most 384, got 30000"),
-        (["--terms", "0"], "'--terms': must be a whole number of at least 1, got 0"),
         (["--lobes", "6"], "--lobes needs --system lobe or dynamic, got separable"),
         (
             ["--modes", "6", "--system", "lobe,harmonic"],
@@ -229,15 +213,9 @@ def test_bad_files_are_named_on_stderr_with_status_2(run, tmp_path, capsys, opti
         (["--brdf", "ashikhmin-shirley", "--terms", "3000"], "terms must be between 1 and .* got 3000"),
         (["--brdf", "ward:along=nan"], "along of ward must be a finite number, got 'nan'"),
         (["--brdf", "merl:absent.binary"], "absent.binary must be a BRDF in MERL's format, and there is no such file"),
-        (["--order", "16"], "'--order': must be a whole number from 1 to 15, got 16"),
-        (["--lobes", "0"], "'--lobes': must be a whole number from 1 to 64, got 0"),
         (["--lobes", "6,x"], "'--lobes': must be a whole number from 1 to 64, got 'x'"),
         (["--elevation", "95"], "'--elevation': must be a finite number from -90 to 90, got 95"),
-        (["--azimuth", "nan"], "'--azimuth': must be a finite number, got nan"),
-        (["--azimuth", "east"], "'--azimuth': must be a finite number, got 'east'"),
         (["--turn", "0,inf"], "'--turn': must be a finite number, got inf"),
-        (["--light-size", "12"], "--light-size must be a power of two, got 12"),
-        (["--table", "-3"], "'--table': must be a whole number of at least 1, got -3"),
         (["--error", "1"], "'--error': must be a finite number above 0 and below 1, got 1"),
         (["--error", "0.1"], "--error needs --system planned, got separable"),
         (["--tone", "reinhard"], "'reinhard' is not one of 'srgb', 'filmic', 'agx', 'aces'"),
@@ -315,13 +293,6 @@ def stop(*_, **__):
     raise KeyboardInterrupt
 
 
-def test_two_skies_of_one_name_are_both_relit(place, glossy):
-    paths = (str(place / "sky.exr"), str(glossy / "other" / "sky.exr"))
-    assert report(glossy)["environments"] == dict(zip(("sky", "sky_2"), paths, strict=True))
-    first, second = (prt.files.read_image(glossy / f"{name}_separable.exr")[0] for name in ("sky", "sky_2"))
-    assert np.abs(first - second).max() > 0.1
-
-
 def test_the_module_runs_as_a_program():
     done = subprocess.run([sys.executable, "-m", "jaxprt", "--help"], check=True, capture_output=True, text=True)
     assert "Usage: jaxprt [OPTIONS] COMMAND" in done.stdout
@@ -330,17 +301,14 @@ def test_the_module_runs_as_a_program():
     assert not done.stderr
 
 
-def test_materials_that_change_are_relit_with_bounces_and_animated_by_every_system(run, tmp_path, capsys):
-    output = tmp_path
+def test_materials_that_change_are_relit_with_bounces_and_animated(run, tmp_path, capsys):
     glossy = ["--material", "mesh=cook-torrance:diffuse=.5,specular=.6/.5/.3,roughness=.4"]
-    several = ["--system", "dynamic,lobe", "--bounces", "2"]
-    assert run("--ground", *several, "--animate", "2", *glossy, output=output) == 0
-    told = report(output)
-    for system in ("dynamic", "lobe"):
-        assert 0.03 < told["lights"]["sky"][system]["reflected_fraction"] < 0.2
-        assert told["lights"]["sky"][system]["picture_error"] < 0.3
-        frames = [prt.files.read_image(output / f"animation_{system}" / f"frame_{n:04d}.png")[0] for n in range(2)]
-        assert np.abs(frames[0] - frames[1]).max() > 0.05
-    whole, direct = (prt.files.read_image(output / f"sky_{name}.exr")[0] for name in ("dynamic_bounces", "dynamic"))
+    assert run("--ground", "--system", "lobe", "--bounces", "2", "--animate", "2", *glossy, output=tmp_path) == 0
+    told = report(tmp_path)["lights"]["sky"]["lobe"]
+    assert 0.03 < told["reflected_fraction"] < 0.2
+    assert told["picture_error"] < 0.3
+    frames = [prt.files.read_image(tmp_path / "animation" / f"frame_{n:04d}.png")[0] for n in range(2)]
+    assert np.abs(frames[0] - frames[1]).max() > 0.05
+    whole, direct = (prt.files.read_image(tmp_path / f"sky_{name}.exr")[0] for name in ("lobe_bounces", "lobe"))
     assert whole.mean() > direct.mean()
     assert "comes from other surfaces" in capsys.readouterr().out

@@ -96,60 +96,50 @@ def test_noise_leaves_a_residual_of_its_size_and_deviations_that_hold(mesh, matt
     assert np.mean(away > 0.5) > 0.4  # 62 % are.
 
 
-def test_much_noise_leaves_less_that_is_determined_and_that_is_right(mesh, matte, sky, view, image):
-    for seed in range(5):
-        found = fit(mesh, matte, Picture(noisy(image, 0.02, seed), view))
-        assert 0.01 < found.residual[-1] < 0.03
-        assert 12 <= found.rank < 54
-        wrong = np.linalg.norm(found.determined @ np.ravel(found.value - sky)) / np.linalg.norm(
-            found.determined @ np.ravel(sky)
-        )
-        # The error that `inverse.light` is asked for: .015 to .040 for these noises, and rounding moves each by .003.
-        assert wrong < 0.05
+def error_of(found, true):
+    """Relative L2 error of what is determined."""
+    wrong, whole = (found.determined @ np.ravel(each) for each in (found.value - true, true))
+    return np.linalg.norm(wrong) / np.linalg.norm(whole)
 
 
-@pytest.mark.parametrize("noise", [0.02, 0.1])
-@pytest.mark.parametrize("error", [0.03, 0.1])
-def test_what_is_determined_is_as_right_as_asked(mesh, matte, sky, view, image, noise, error):
-    pixels = inverse.observe(mesh, [Picture(noisy(image, noise), view)])
-    found = inverse.light(matte, jnp.zeros_like(sky), pixels, error=error)
-    assert found.rank >= 3
-    wrong = np.linalg.norm(found.determined @ np.ravel(found.value - sky)) / np.linalg.norm(
-        found.determined @ np.ravel(sky)
-    )
-    assert wrong < 2 * error
+# Asked for .05, pictures with a noise of .02 give .015 to .040 from seed to seed, and rounding moves each by .003.
+@pytest.mark.parametrize(
+    ("noise", "seed", "asked", "most"),
+    [*((0.02, seed, 0.05, 0.05) for seed in range(3)), (0.02, 0, 0.1, 0.2), (0.1, 0, 0.03, 0.06), (0.1, 0, 0.1, 0.2)],
+)
+def test_noise_leaves_less_that_is_determined_and_that_is_as_right_as_asked(
+    mesh, matte, sky, view, image, noise, seed, asked, most
+):
+    pixels = inverse.observe(mesh, [Picture(noisy(image, noise, seed), view)])
+    found = inverse.light(matte, jnp.zeros_like(sky), pixels, error=asked)
+    assert 0.5 * noise < found.residual[-1] < 1.5 * noise
+    assert 3 <= found.rank < 54
+    assert noise > 0.02 or found.rank >= 12
+    assert error_of(found, sky) < most
 
 
 def test_light_finer_than_its_numbers_does_not_pass_for_them(mesh, dull, view):
     """What is left of the pictures is no noise but harmonics of higher degrees, in patterns wider than any block."""
     light = builtin.daylight(size=16)
-    low, high = dull(2), dull(4)
-    image = render(mesh, high(harmonic.project(light, degree=4), view.eye), view, samples=1)
-    found = inverse.light(low, jnp.zeros((9, 3)), inverse.observe(mesh, [Picture(image, view)]), error=0.1)
-    true = harmonic.project(light, degree=2)
-    wrong = np.linalg.norm(found.determined @ np.ravel(found.value - true)) / np.linalg.norm(
-        found.determined @ np.ravel(true)
-    )
+    image = render(mesh, dull(4)(harmonic.project(light, degree=4), view.eye), view, samples=1)
+    found = inverse.light(dull(2), jnp.zeros((9, 3)), inverse.observe(mesh, [Picture(image, view)]), error=0.1)
     assert found.residual[-1] > 1e-3
     assert found.rank >= 3
-    assert wrong < 0.25  # More than asked for: no block is free of such a pattern.
+    # More than asked for: no block is free of such a pattern.
+    assert error_of(found, harmonic.project(light, degree=2)) < 0.25
 
 
-@pytest.mark.parametrize("degree", [2, 3])
-def test_of_a_sun_some_is_determined_although_most_of_it_is_too_fine(mesh, dull, view, degree):
+def test_of_a_sun_some_is_determined_although_most_of_it_is_too_fine(mesh, dull, view):
     """Combinations that are left out must not make the others count as undetermined, one after another."""
     light = np.zeros((6, 16, 16, 3), np.float32)
     light[2, 8:11, 3:6] = 50
-    low, high = dull(degree), dull(6)
-    image = render(mesh, high(harmonic.project(Environment(jnp.asarray(light)), degree=6), view.eye), view, samples=1)
+    light = Environment(jnp.asarray(light))
+    image = render(mesh, dull(6)(harmonic.project(light, degree=6), view.eye), view, samples=1)
     pixels = inverse.observe(mesh, [Picture(np.maximum(image, 0), view)])
-    found = inverse.light(low, jnp.zeros(((degree + 1) ** 2, 3)), pixels, error=0.05)
-    true = harmonic.project(Environment(jnp.asarray(light)), degree=degree)
-    wrong = np.linalg.norm(found.determined @ np.ravel(found.value - true)) / np.linalg.norm(
-        found.determined @ np.ravel(true)
-    )
-    assert found.rank >= 9
-    assert wrong < 0.1
+    for degree in (2, 3):
+        found = inverse.light(dull(degree), jnp.zeros(((degree + 1) ** 2, 3)), pixels, error=0.05)
+        assert found.rank >= 9
+        assert error_of(found, harmonic.project(light, degree=degree)) < 0.1
 
 
 def test_light_from_behind_is_known_badly(mesh, matte, view, image):
@@ -179,31 +169,22 @@ def test_a_flat_objective_stays_at_its_start(mesh, view, image):
     np.testing.assert_allclose(many.value["unused"], 0.4)
 
 
-def test_an_unused_number_is_unknown_and_the_others_are_found(mesh, matte, sky, view, image):
-    pixels = inverse.observe(mesh, [Picture(image, view)])
-    start = {"albedo": jnp.array(0.9), "unused": jnp.array(0.2)}
-    found = inverse.material(lambda m, eye: m["albedo"] / 0.5 * matte(sky, eye), start, pixels, lower=0.0, upper=1.0)
-    assert found.rank == 1
-    assert float(found.value["albedo"]) == pytest.approx(0.5, abs=1e-4)
-    assert float(found.value["unused"]) == pytest.approx(0.2, abs=1e-4)
-    assert np.isfinite(found.deviation["albedo"])
-    assert np.isinf(found.deviation["unused"])
-
-
-def test_a_region_that_no_picture_shows_is_unknown_and_the_other_is_found(mesh, matte, sky, view, image):
+def test_what_no_picture_shows_is_unknown_and_the_rest_is_found(mesh, matte, sky, view, image):
     pixels = inverse.observe(mesh, [Picture(image, view)])
     behind = (mesh.position @ (view.eye / jnp.linalg.norm(view.eye)) < -0.2)[:, None]
     found = inverse.material(
         lambda m, eye: jnp.where(behind, m["behind"], m["front"]) / 0.5 * matte(sky, eye),
-        {"front": jnp.full(3, 0.9), "behind": jnp.full(3, 0.3)},
+        {"front": jnp.full(3, 0.9), "behind": jnp.full(3, 0.3), "unused": jnp.array(0.2)},
         pixels,
         lower=0.0,
         upper=1.0,
     )
+    assert found.rank == 3
     np.testing.assert_allclose(found.value["front"], 0.5, atol=1e-3)
-    np.testing.assert_allclose(found.value["behind"], 0.3, atol=1e-4)
     assert np.isfinite(found.deviation["front"]).all()
-    assert np.isinf(found.deviation["behind"]).all()
+    for name, start in (("behind", 0.3), ("unused", 0.2)):
+        np.testing.assert_allclose(found.value[name], start, atol=1e-4)
+        assert np.isinf(found.deviation[name]).all()
 
 
 def test_a_mirror_like_material_is_found_from_a_matte_start(mesh, view, monkeypatch):
@@ -257,7 +238,6 @@ def test_half_of_the_pixels_of_a_coarse_mesh_count(view):
         (lambda x, eye: jnp.exp(x), "must be linear in the light"),
         (lambda x, eye: x * jnp.nan, "must be finite"),
         (lambda x, eye: x[:-5], r"radiance must be \[482, 3\], vertices and colors of the pictures, got \[477, 3\]"),
-        (lambda x, eye: x[:, :1], r"got \[482, 1\]"),
         (lambda x, eye: x[:, 0], r"got \[482\]"),
         (lambda x, eye: None, "got NoneType"),
     ],
@@ -373,20 +353,14 @@ START = {"a": 0.3, "b": 0.5}
 
 
 @pytest.mark.parametrize("fit", [inverse.light, inverse.material])
-def test_numbers_at_their_bounds_have_no_deviation_and_others_have(shaded, fit):
-    radiance, pixels = shaded
-    for low, high, at in ((0.0, 0.7, "a"), (0.2, 1.0, "b")):
-        found = fit(radiance, START, pixels, lower=low, upper=high)
-        other = "b" if at == "a" else "a"
-        assert float(found.value[at]) == pytest.approx(high if at == "a" else low, abs=1e-4)
-        assert np.isinf(found.deviation[at])
-        assert 0 < float(found.deviation[other]) < 0.02
-
-
-@pytest.mark.parametrize("fit", [inverse.light, inverse.material])
-def test_bounds_that_do_not_bind_change_nothing(shaded, fit):
+def test_numbers_at_their_bounds_have_no_deviation_and_bounds_that_do_not_bind_change_nothing(shaded, fit):
     """Descent stopped on the far side of the minimum, where momentum had taken it."""
     radiance, pixels = shaded
+    for low, high, at, other, value in ((0.0, 0.7, "a", "b", 0.7), (0.2, 1.0, "b", "a", 0.2)):
+        found = fit(radiance, START, pixels, lower=low, upper=high)
+        assert float(found.value[at]) == pytest.approx(value, abs=1e-4)
+        assert np.isinf(found.deviation[at])
+        assert 0 < float(found.deviation[other]) < 0.02
     free = fit(radiance, START, pixels)
     for bound in ({"lower": 0.0}, {"lower": {"a": None, "b": -1.0}}, {"lower": None, "upper": {"a": 2.0, "b": None}}):
         found = fit(radiance, START, pixels, **bound)
@@ -408,51 +382,42 @@ def test_fits_inside_transformations_are_refused_by_name(shaded):
                     transform(inside)(0.5)
 
 
+FITS = [
+    ({"steps": 2.5}, TypeError, "steps must be a whole number, got 2.5"),
+    ({"steps": 0}, ValueError, "steps must be at least 1, got 0"),
+    ({"lower": {"a": 0.0}}, ValueError, "one number, or made like the start"),
+    ({"lower": {"a": "red", "b": 0.0}}, ValueError, r"a bound must be a number, None, or .* \[\], got <U3"),
+    ({"upper": {"a": np.ones(3), "b": 1.0}}, ValueError, r"like what it bounds, \[\], got float64\[3\]"),
+    ({"pixels": [1.0]}, TypeError, "pixels must be from jaxprt.inverse.observe, got list"),
+    ({"radiance": None}, TypeError, "the radiance must be a function, got NoneType"),
+]
+LIGHTS = [
+    ({"error": None}, ValueError, "the error must be a positive number, got None"),
+    ({"prior": 0.1}, TypeError, "the prior must be a function, got float"),
+    ({"prior": lambda x: x["a"] * jnp.ones(2)}, ValueError, r"the prior must be one number .* got .*shape=\(2,\)"),
+    ({"prior": lambda x: None}, ValueError, "the prior must be one number of floating point, got None"),
+    ({"prior": inverse.smoothness}, ValueError, r"of texels, \[6, n, n, c\], got dict: for an Environment"),
+]
+MATERIALS = [
+    ({"start": {"a": 0.5}, "lower": 0.6}, ValueError, "number 0 is 0.5, the bounds are 0.6 and inf"),
+    ({"start": {"a": 0.5}, "lower": 0.5, "upper": 0.5}, ValueError, "lower bounds must be less"),
+    ({"start": {"a": 0.5, "b": "red"}}, TypeError, "arrays and numbers, in a pytree, got a str"),
+    ({"start": {"a": np.nan}}, ValueError, "the start, its numbers in a row, must be finite, got 1 of 1"),
+    ({"start": {"a": np.ones(600)}}, ValueError, "at most 512 parameters can be fitted by this method, got 600"),
+    ({"start": {}}, ValueError, "at least one number, got none"),
+]
+
+
 @pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"steps": 2.5}, TypeError, "steps must be a whole number, got 2.5"),
-        ({"steps": None}, TypeError, "steps must be a whole number, got None"),
-        ({"steps": 0}, ValueError, "steps must be at least 1, got 0"),
-        ({"error": None}, ValueError, "the error must be a positive number, got None"),
-        ({"prior": 0.1}, TypeError, "the prior must be a function, got float"),
-        ({"prior": lambda x: x["a"] * jnp.ones(2)}, ValueError, r"the prior must be one number .* got .*shape=\(2,\)"),
-        ({"prior": lambda x: None}, ValueError, "the prior must be one number of floating point, got None"),
-        ({"prior": inverse.smoothness}, ValueError, r"of texels, \[6, n, n, c\], got dict: for an Environment"),
-        ({"lower": {"a": 0.0}}, ValueError, "one number, or made like the start"),
-        ({"lower": {"a": "red", "b": 0.0}}, ValueError, r"a bound must be a number, None, or .* \[\], got <U3"),
-        ({"lower": [0.0, 0.0]}, ValueError, "one number, or made like the start"),
-        ({"upper": {"a": np.ones(3), "b": 1.0}}, ValueError, r"like what it bounds, \[\], got float64\[3\]"),
-        ({"pixels": [1.0]}, TypeError, "pixels must be from jaxprt.inverse.observe, got list"),
-        ({"radiance": None}, TypeError, "the radiance must be a function, got NoneType"),
-    ],
-)
-def test_lights_that_cannot_be_fitted_are_refused(shaded, options, error, message):
-    given = {"radiance": shaded[0], "start": START, "pixels": shaded[1], **options}
-    with pytest.raises(error, match=message):
-        inverse.light(**given)
-    if "prior" not in options and "error" not in options:
+def test_what_cannot_be_fitted_is_refused(shaded):
+    radiance, pixels = shaded
+    for fits, rows in (((inverse.light, inverse.material), FITS), ((inverse.light,), LIGHTS)):
+        for options, error, message in rows:
+            for fit in fits:
+                with pytest.raises(error, match=message):
+                    fit(**{"radiance": radiance, "start": START, "pixels": pixels, **options})
+    for options, error, message in MATERIALS:
         with pytest.raises(error, match=message):
-            inverse.material(**given)
+            inverse.material(lambda m, eye: jnp.zeros((pixels.vertices, 3)), pixels=pixels, **options)
     with pytest.raises(TypeError, match="the start must be a light and a material, a pair, got dict"):
-        inverse.jointly(*shaded[:1], START, shaded[1])
-
-
-@pytest.mark.parametrize(
-    ("start", "options", "error", "message"),
-    [
-        ({"a": 0.5}, {"lower": 0.6}, ValueError, "number 0 is 0.5, the bounds are 0.6 and inf"),
-        ({"a": 0.5}, {"lower": 0.5, "upper": 0.5}, ValueError, "lower bounds must be less"),
-        ({"a": 0.5}, {"lower": {"b": 0.1}}, ValueError, "one number, or made like the start"),
-        ({"a": 0.5, "b": "red"}, {}, TypeError, "arrays and numbers, in a pytree, got a str"),
-        ({"a": np.nan}, {}, ValueError, "the start, its numbers in a row, must be finite, got 1 of 1"),
-        ({"a": np.ones(600)}, {}, ValueError, "at most 512 parameters can be fitted by this method, got 600"),
-        ({"a": 0.5}, {"steps": 0}, ValueError, "steps must be at least 1, got 0"),
-        ({}, {}, ValueError, "at least one number, got none"),
-    ],
-)
-def test_materials_that_cannot_be_fitted_are_refused(mesh, view, image, start, options, error, message):
-    pixels = inverse.observe(mesh, [Picture(image, view)])
-    with pytest.raises(error, match=message):
-        inverse.material(lambda m, eye: jnp.zeros((len(mesh.position), 3)), start, pixels, **options)
+        inverse.jointly(radiance, START, pixels)

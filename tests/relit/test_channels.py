@@ -98,15 +98,6 @@ def test_weights_times_channels_are_the_material_of_each_vertex(name, close):
     close(evaluated(shading.exact, *jnp.swapaxes(jnp.stack([wi, wo]), 1, 2)), np.swapaxes(expected, 0, 1))
 
 
-def test_vertex_colors_multiply_the_base_color(close):
-    factor, images = MATERIALS["color"]
-    tint = image(channels=3).reshape(COUNT, 3)
-    shading = of_part(patch(textured(factor, images), color=tint))
-    wi, wo = pairs()
-    expected = at_vertices(factor, {"base_color": images["base_color"].reshape(-1, 3) * tint})
-    close(blended(shading, shading.blend, wi, wo), evaluated(expected, wi, wo))
-
-
 @pytest.mark.parametrize("name", MATERIALS)
 def test_another_material_has_its_own_weights_whatever_the_scale(name, close):
     """The part is made for one material and shown with another; scales are those of the first."""
@@ -125,17 +116,36 @@ def test_materials_with_the_standard_tables_have_all_channels_and_others_those_t
     assert all(terms[name] == (0, 1, 2, 3) for name in ("smooth", "color", "metallic", "ior", "specular", "tint"))
     assert terms["roughness"] == (0, 1, 2)  # anisotropic
     assert terms["diffuse"] == (3,)
-    alone = {name: of_part(patch(textured(*each)), takes=lambda table: False).term for name, each in MATERIALS.items()}
-    assert alone["smooth"] == (1, 2)
-    assert alone["color"] == alone["metallic"] == alone["ior"] == (0, 1, 2)
-    assert alone["specular"] == alone["tint"] == (0, 1, 2, 3)
+    alone = {name: of_part(patch(textured(*each)), takes=lambda table: False) for name, each in MATERIALS.items()}
+    assert alone["smooth"].term == (1, 2)
+    assert alone["color"].term == alone["metallic"].term == alone["ior"].term == (0, 1, 2)
+    assert alone["specular"].term == alone["tint"].term == (0, 1, 2, 3)
+    # Weights are about one, except for rare channels: a fit of all channels together is then about what is seen.
+    mean = np.mean(np.asarray(alone["metallic"].blend.weight), (0, 2))
+    assert np.all((mean > 1e-3) & (mean < 1.001))
+    assert np.any(mean > 0.99)
 
 
-def test_what_is_ideally_diffuse_is_a_white_lambert_brdf_without_knots():
-    shading = of_part(patch(textured(*MATERIALS["diffuse"])))
-    assert isinstance(shading.brdf, Lambert)
-    assert shading.knot == shading.blend.parameter == ()
-    np.testing.assert_allclose(shading.blend.weight[:, 0], COLOR.reshape(-1, 3), rtol=1e-6)
+def test_diffuse_and_even_materials_need_no_knots_and_plain_brdfs_no_weights(close):
+    diffuse = of_part(patch(textured(*MATERIALS["diffuse"])))
+    assert isinstance(diffuse.brdf, Lambert)
+    assert diffuse.knot == diffuse.blend.parameter == ()
+    close(diffuse.blend.weight[:, 0], COLOR.reshape(-1, 3), tolerance=1e-6)
+    tint = image(channels=3).reshape(COUNT, 3)  # colors of vertices multiply those of the texture
+    tinted = of_part(patch(textured(*MATERIALS["diffuse"]), color=tint))
+    close(tinted.blend.weight[:, 0], COLOR.reshape(-1, 3) * tint, tolerance=1e-6)
+    even = textured({"roughness": 0.5}, {"roughness": jnp.full((ROWS, COLUMNS, 1), 0.8)})
+    alike = of_part(patch(even), takes=lambda table: False)
+    assert alike.knot == alike.blend.parameter == ()
+    assert isinstance(alike.brdf, Channels)
+    np.testing.assert_allclose(alike.brdf.model[0].roughness, 0.4, rtol=1e-6)
+    plain = of_part(patch(model := AshikhminShirley()))
+    assert plain.brdf is plain.exact is model
+    assert plain.blend is None
+    function = of_part(patch(lambda wi, wo: wi[..., :1] * 0 + 0.25))  # becomes what jitted functions take
+    assert np.all(jax.jit(lambda each, wi, wo: each.brdf(wi, wo))(function, *pairs()) == 0.25)
+    turned = patch(TexturedMaterial(rotation=0.7))  # without anisotropy
+    assert of_part(turned).mesh is turned.mesh
 
 
 def test_a_black_material_reflects_nothing_and_emits_what_it_emits():
@@ -144,18 +154,7 @@ def test_a_black_material_reflects_nothing_and_emits_what_it_emits():
     shading = of_part(patch(textured(black, {"emissive": glow})))
     assert not np.any(shading.blend.weight)
     np.testing.assert_allclose(shading.emitted, np.asarray(glow).reshape(-1, 3) * [2, 3, 4], rtol=1e-6)
-
-
-def test_what_emits_nothing_has_none():
     assert of_part(patch(TexturedMaterial())).emitted is None
-
-
-def test_weights_of_channels_are_about_one_except_for_rare_ones():
-    """A fit of all channels together is then about what is seen."""
-    shading = of_part(patch(textured(*MATERIALS["metallic"])), takes=lambda table: False)
-    mean = np.mean(np.asarray(shading.blend.weight), (0, 2))
-    assert np.all((mean > 1e-3) & (mean < 1.001))
-    assert np.any(mean > 0.99)
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.2, 1.0), (0.0, 0.5), (0.4, 0.41)])
@@ -180,14 +179,6 @@ def test_a_part_with_the_standard_tables_takes_any_roughness():
         np.testing.assert_allclose(other.parameter[0], np.log(max(roughness, 1e-3**0.5)), atol=1e-6)
         right = evaluated(at_vertices({"roughness": max(roughness, 1e-3**0.5), "metallic": 0.5}, {}), wi, wo)
         np.testing.assert_allclose(blended(shading, other, wi, wo), right, rtol=2e-4, atol=1e-5)
-
-
-def test_roughness_of_one_value_needs_no_knots():
-    even = textured({"roughness": 0.5}, {"roughness": jnp.full((ROWS, COLUMNS, 1), 0.8)})
-    shading = of_part(patch(even), takes=lambda table: False)
-    assert shading.knot == shading.blend.parameter == ()
-    assert isinstance(shading.brdf, Channels)
-    np.testing.assert_allclose(shading.brdf.model[0].roughness, 0.4, rtol=1e-6)
 
 
 @pytest.mark.parametrize("hand", [1.0, -1.0])
@@ -220,11 +211,6 @@ def test_tangents_lie_along_the_anisotropy_as_if_the_material_turned(hand, close
     close(blended(shading, shading.blend, *new), np.broadcast_to(value, (*value.shape[:2], 3)), tolerance=1e-4)
 
 
-def test_rotation_without_anisotropy_leaves_the_mesh_alone():
-    part = patch(TexturedMaterial(rotation=0.7))
-    assert of_part(part).mesh is part.mesh
-
-
 def test_a_texture_of_anisotropy_counts_as_its_mean_and_says_so():
     texel = np.full((ROWS, COLUMNS, 3), 0.5, np.float32)
     texel[..., 0], texel[..., 2] = 1.0, np.linspace(0, 1, COUNT).reshape(ROWS, COLUMNS)
@@ -232,25 +218,6 @@ def test_a_texture_of_anisotropy_counts_as_its_mean_and_says_so():
     with pytest.warns(UserWarning, match=r"anisotropy of part 'patch' varies from 0\.00 to 0\.80 .* its mean 0\.40"):
         shading = of_part(part)
     np.testing.assert_allclose(shading.exact.model.anisotropy, 0.4, rtol=1e-6)
-
-
-def test_a_plain_brdf_stays_as_it_is():
-    model = AshikhminShirley()
-    shading = of_part(patch(model))
-    assert shading.brdf is shading.exact is model
-    assert shading.blend is None
-
-
-def test_a_function_becomes_what_jitted_functions_take():
-    shading = of_part(patch(lambda wi, wo: wi[..., :1] * 0 + 0.25))
-    wi, wo = pairs()
-    assert np.all(jax.jit(lambda each: each.brdf(wi, wo))(shading) == 0.25)
-
-
-def test_brdfs_of_another_form_are_refused():
-    each = PerVertex(Lambert(jnp.ones((COUNT, 1))))
-    with pytest.raises(TypeError, match="part 'patch' must be one BRDF for all vertices or a TexturedMaterial, got a"):
-        of_part(patch(each))
 
 
 NEW = {
@@ -275,19 +242,16 @@ def metal(**change) -> TexturedMaterial:
     return TexturedMaterial(**({"roughness": 0.5, "anisotropy": 0.5} | change), roughness_texture=Texture(rough))
 
 
-@pytest.mark.parametrize("name", NEW)
-def test_materials_that_need_what_was_not_precomputed_are_refused(name):
-    change, message = NEW[name]
+def test_materials_that_need_what_was_not_precomputed_are_refused():
     part = patch(metal())
-    with pytest.raises(ValueError, match=message):
-        appearance(part, of_part(part), metal(**change))
-
-
-def test_a_material_with_textures_needs_texture_coordinates():
-    bare = patch(metal())
-    part = Part("patch", make_mesh(bare.mesh.position, bare.mesh.face), TexturedMaterial())
+    for change, message in NEW.values():
+        with pytest.raises(ValueError, match=message):
+            appearance(part, of_part(part), metal(**change))
+    bare = Part("patch", make_mesh(part.mesh.position, part.mesh.face), TexturedMaterial())
     with pytest.raises(ValueError, match=r"part 'patch' must have mesh\.texture for the textures of its"):
-        appearance(part, of_part(part), metal())
+        appearance(bare, of_part(part), metal())
+    with pytest.raises(TypeError, match="part 'patch' must be one BRDF for all vertices or a TexturedMaterial, got a"):
+        of_part(patch(PerVertex(Lambert(jnp.ones((COUNT, 1))))))
 
 
 def test_inside_a_program_vertices_that_need_what_was_not_precomputed_are_nan():

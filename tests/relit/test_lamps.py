@@ -11,6 +11,7 @@ import pytest
 import jaxprt as prt
 from jaxprt import lobe
 from jaxprt.brdf import Lambert
+from jaxprt.image import automatic_exposure
 from jaxprt.relit import Harmonics, RelitScene, exact, exact_lamps, probes, reflection
 from jaxprt.relit.channels import of_part
 from jaxprt.scene import Camera, Environment, Part, PointLight, Scene, TexturedMaterial, builtin
@@ -45,69 +46,60 @@ def scene() -> Scene:
     return Scene(parts, [CAMERA], point_lights=[BULB])
 
 
+OFF = {"panel": TexturedMaterial(**BLACK), "bulb": dataclasses.replace(BULB, intensity=np.zeros(3))}
+
+
+@functools.cache
+def around() -> Environment:
+    return Environment(jnp.asarray(np.random.default_rng(0).uniform(size=(6, 8, 8, 3)).astype(np.float32)))
+
+
 @functools.cache
 def relit() -> RelitScene:
     return prt.precompute(scene(), refine=False, system=Harmonics(degree=2), size=8, progress=False)
 
 
-def test_parts_that_emit_light_others_and_shine_themselves(close):
+def test_lamps_shine_and_light_others_and_add_to_the_light_around(close):
     color = np.asarray(relit().radiance(DARK, eye=EYE))
     np.testing.assert_array_equal(color[25:], np.broadcast_to(np.float32(WARM), (25, 3)))
-    off = {"panel": TexturedMaterial(**BLACK), "bulb": PointLight("bulb", BULB.position, 0.0)}
-    assert not np.any(relit().radiance(DARK, eye=EYE, materials=off))
     # What one lamp sends and what another sends add up, in each color by itself.
-    red = {"panel": TexturedMaterial(**BLACK, emissive=(4.0, 0.0, 0.0)), "bulb": off["bulb"]}
+    red = {"panel": TexturedMaterial(**BLACK, emissive=(4.0, 0.0, 0.0)), "bulb": OFF["bulb"]}
     rest = {"panel": TexturedMaterial(**BLACK, emissive=(0.0, 3.0, 2.0))}
-    both = sum(np.asarray(relit().radiance(DARK, eye=EYE, materials=each)) for each in (red, rest))
-    close(both, color)
+    close(sum(np.asarray(relit().radiance(DARK, eye=EYE, materials=each)) for each in (red, rest)), color)
+    batch = Environment(jnp.stack([around().radiance, DARK.radiance]))
+    whole, bare = (np.asarray(relit().radiance(batch, eye=EYE, materials=each)) for each in (None, OFF))
+    close(whole[1], color)
+    assert not np.any(bare[1])
+    close(whole[0], bare[0] + color)
 
 
-def test_lamps_add_to_the_light_around(close):
-    around = Environment(jnp.asarray(np.random.default_rng(0).uniform(size=(6, 8, 8, 3)).astype(np.float32)))
-    off = {"panel": TexturedMaterial(**BLACK), "bulb": PointLight("bulb", BULB.position, 0.0)}
-    whole, alone, dark = (
-        np.asarray(relit().radiance(light, eye=EYE, materials=each))
-        for light, each in ((around, None), (around, off), (DARK, None))
-    )
-    close(whole, alone + dark)
-    batch = relit().radiance(Environment(jnp.stack([around.radiance, DARK.radiance])), eye=EYE)
-    close(np.asarray(batch), np.stack([whole, dark]))
+def test_exposure_is_not_of_lamps():
+    camera = dataclasses.replace(CAMERA, target=np.array([0.0, 0.5, -0.8]), field_of_view=0.4)
+    layers = relit().picture(DARK, camera, layers=["color", "part"])
+    picture, panel = layers["color"], np.asarray(layers["part"]) == 1
+    inside = np.all([np.roll(panel, step, axis) for axis in (0, 1) for step in (-1, 0, 1)], 0)
+    assert inside.sum() > 5
+    brighter = jnp.where(inside[..., None], 1e4, picture)
+    stops = float(relit().exposure(picture, camera))
+    assert float(relit().exposure(brighter, camera)) == pytest.approx(stops, abs=1e-5)
+    assert float(automatic_exposure(brighter, coverage=relit().coverage(camera))) < stops - 2
 
 
 def test_layers_by_light_are_pictures_of_their_light_alone_and_add_up(close):
-    around = Environment(jnp.asarray(np.random.default_rng(0).uniform(size=(6, 8, 8, 3)).astype(np.float32)))
     right = (np.asarray(cubemap.direction(size=8))[..., 0] > 0).astype(np.float32)
     traced = relit().picture_view()
-    close(sum(traced.mix(around, regions={"right": right}).values()), traced.picture(around))
-    layers = relit().picture_view(shadows="vertices").mix(around, regions={"right": right})
+    close(sum(traced.mix(around(), regions={"right": right}).values()), traced.picture(around()))
+    layers = relit().picture_view(shadows="vertices").mix(around(), regions={"right": right})
     assert list(layers) == ["right", "panel", "bulb", "rest", "background"]
-    off = {"panel": TexturedMaterial(**BLACK), "bulb": PointLight("bulb", BULB.position, 0.0)}
     alone = {
-        "right": (Environment(around.radiance * right[..., None]), off),
-        "panel": (DARK, {"bulb": off["bulb"]}),
-        "bulb": (DARK, {"panel": off["panel"]}),
-        "rest": (Environment(around.radiance * (1 - right[..., None])), off),
+        "right": (Environment(around().radiance * right[..., None]), OFF),
+        "panel": (DARK, {"bulb": OFF["bulb"]}),
+        "bulb": (DARK, {"panel": OFF["panel"]}),
+        "rest": (Environment(around().radiance * (1 - right[..., None])), OFF),
     }
     for name, (light, materials) in alone.items():
         picture = relit().picture(light, materials=materials, background=None, shadows="vertices")
         close(layers[name], picture[..., :3], tolerance=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("regions", "words"),
-    [
-        ({"panel": np.ones((6, 8, 8))}, "other than panel, bulb, rest, background"),
-        ({"a/b": np.ones((6, 8, 8))}, "a name of letters"),
-        ({"one": np.ones((6, 8, 8)), "two": np.ones((6, 8, 8))}, "add up to at most 1 in each texel, got 2"),
-        ({"sun": np.ones((6, 4, 4))}, "must have the"),
-        ({"sun": np.full((6, 8, 8), 2.0)}, "must be from 0 to 1, got 2 to 2"),
-        ({"sun": np.full((6, 8, 8), np.nan)}, "finite"),
-    ],
-    ids=["name", "letters", "overlap", "size", "range", "nan"],
-)
-def test_regions_that_are_none_are_refused(regions, words):
-    with pytest.raises(ValueError, match=words):
-        relit().picture_view().mix(DARK, regions=regions)
 
 
 def test_pictures_have_the_derivatives_of_their_lamps():
@@ -163,28 +155,6 @@ def test_shadows_between_vertices_are_at_their_pixels():
     np.testing.assert_allclose(jax.grad(total)(1.0), total(1.0), rtol=1e-4)
 
 
-def test_gradients_in_color_and_strength_are_what_lamps_send():
-    """Radiance is linear in both, so that derivatives are differences."""
-    weight = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32)
-
-    def sent(emissive, intensity):
-        given = {
-            "panel": TexturedMaterial(**BLACK, emissive=emissive),
-            "bulb": PointLight("bulb", BULB.position, intensity),
-        }
-        return jnp.sum(relit().radiance(DARK, eye=EYE, materials=given)[:25] * weight[:25])
-
-    one = (jnp.ones(3), jnp.ones(3))
-    for number in (0, 1):
-        got = np.asarray(jax.grad(sent, argnums=number)(*one))
-        every = [list(one) for _ in range(3)]
-        for color in range(3):
-            every[color][number] = one[number].at[color].add(1)
-        expected = np.array([sent(*each) - sent(*one) for each in every])
-        np.testing.assert_allclose(got, expected, rtol=1e-3)
-    np.testing.assert_allclose(jax.jit(sent)(*one), sent(*one), rtol=1e-5)
-
-
 @functools.cache
 def hollow(bounces: int | str) -> RelitScene:
     """A hollow sphere that glows inside."""
@@ -195,53 +165,28 @@ def hollow(bounces: int | str) -> RelitScene:
     return prt.precompute(Scene([Part("hollow", inside, glowing)]), bounces=bounces, **options)
 
 
-@pytest.mark.parametrize(("bounces", "share"), [(2, 0.75), ("all", 1.0)])
-def test_light_of_lamps_is_reflected_any_number_of_times(bounces, share):
+def test_lamps_are_reflected_any_number_of_times_in_proportion_to_their_color(close):
     """In a hollow sphere of albedo 1/2 each bounce has half of the light of the one before it."""
     eye = jnp.array([0.1, 0.2, 0.3])
-    whole, direct = (scene.radiance(DARK, eye=eye) for scene in (hollow(bounces), hollow(bounces).without_bounces()))
-    np.testing.assert_allclose(direct, 1.5, rtol=0.02)  # 1 is the emission; the sphere has flat faces
-    np.testing.assert_allclose(whole - direct, share * (direct.mean() - 1), rtol=0.01)
-
-
-def test_reflected_light_of_lamps_is_linear_in_their_color(close):
-    eye, red = jnp.array([0.1, 0.2, 0.3]), (3.0, 0.0, 0.0)
-    glowing = TexturedMaterial(base_color=0.5, metallic=0.0, specular=0.0, emissive=red)
-    color = hollow(2).radiance(DARK, eye=eye, materials={"hollow": glowing})
-    close(color, np.asarray(hollow(2).radiance(DARK, eye=eye)) * red)
+    for bounces, share in ((2, 0.75), ("all", 1.0)):
+        ready = hollow(bounces)
+        whole, direct = (scene.radiance(DARK, eye=eye) for scene in (ready, ready.without_bounces()))
+        np.testing.assert_allclose(direct, 1.5, rtol=0.02)  # 1 is the emission; the sphere has flat faces
+        np.testing.assert_allclose(whole - direct, share * (direct.mean() - 1), rtol=0.01)
+    red = TexturedMaterial(base_color=0.5, metallic=0.0, specular=0.0, emissive=(3.0, 0.0, 0.0))
+    close(ready.radiance(DARK, eye=eye, materials={"hollow": red}), np.asarray(whole) * (3.0, 0.0, 0.0))
+    shading = of_part(ready.scene.parts[0])
+    np.testing.assert_allclose(reflection.fractions([shading], [DARK])[:, 0], [0.5, 0.25, 0.125], rtol=0.03)
 
 
 def test_probes_see_the_light_and_the_parts_where_they_are(close):
     """Far above, a probe sees the environment alone; near the panel, the panel's radiance in its direction."""
-    around = Environment(jnp.asarray(np.random.default_rng(2).uniform(size=(6, 8, 8, 3)).astype(np.float32)))
-    far, near = probes.sample(relit(), around, [[0, 80.0, 0], [0.0, 0.6, -0.5]], size=4)
-    close(np.asarray(far.radiance), np.asarray(background(around, cubemap.direction(size=4))))
+    far, near = probes.sample(relit(), around(), [[0, 80.0, 0], [0.0, 0.6, -0.5]], size=4)
+    close(np.asarray(far.radiance), np.asarray(background(around(), cubemap.direction(size=4))))
     # Faces are +x, -x, +y, -y, +z, -z: the panel fills most of the last, the floor most of the fourth.
     np.testing.assert_allclose(np.asarray(near.radiance)[5, 1:3, 1:3], np.broadcast_to(WARM, (2, 2, 3)), rtol=1e-5)
-    behind = np.asarray(background(around, cubemap.direction(size=4)))[4]
+    behind = np.asarray(background(around(), cubemap.direction(size=4)))[4]
     close(np.asarray(near.radiance)[4, :2], behind[:2])
-    with pytest.raises(ValueError, match=r"positions must be \[p, 3\], got \[3\]"):
-        probes.sample(relit(), around, np.zeros(3))
-
-
-def test_what_was_not_precomputed_is_refused():
-    given = [
-        (
-            {"floor": TexturedMaterial(roughness=0.6, metallic=0.0, emissive=1.0)},
-            "'floor' was precomputed without emis",
-        ),
-        ({"bulb": PointLight("bulb", [0, 1, 0], 1.0)}, "point light 'bulb' was traced from"),
-        (
-            {"bulb": PointLight("bulb", BULB.position, 1.0, axis=[0, -1, 0])},
-            r"traced with the axis and cone of all directions, got \[0.0, -1.0, 0.0\], \(0.0",
-        ),
-        ({"sun": PointLight("sun", [0, 1, 0], 1.0)}, r"point lights must be among those of the scene, \['bulb'\]"),
-    ]
-    for materials, message in given:
-        with pytest.raises(ValueError, match=message):
-            relit().radiance(DARK, eye=EYE, materials=materials)
-    with pytest.raises(ValueError, match="several named"):
-        Scene(scene().parts, point_lights=[PointLight("floor", [0, 1, 0])])
 
 
 def test_reference_light_of_lamps_has_its_closed_forms():
@@ -272,13 +217,6 @@ def test_reports_measure_lamps_too():
     assert 0 < report.part[0].vertex_errors[0] < 0.2
 
 
-def test_lamps_that_are_off_reflect_nothing():
-    ready = hollow(2)
-    blends = [appearance.blend for appearance in ready.appearance]
-    (arriving,) = ready.bounces.shade(ready.light(DARK).transferred, blends)
-    np.testing.assert_array_equal(arriving, 0)
-
-
 def test_exact_pictures_under_gray_light_have_the_colors_of_lamps():
     gray = Environment(jnp.full((6, 8, 8, 1), 0.3))
     parts = scene().parts
@@ -288,6 +226,34 @@ def test_exact_pictures_under_gray_light_have_the_colors_of_lamps():
     assert np.linalg.norm(picture - close_to) < 0.1 * np.linalg.norm(picture)
 
 
-def test_plans_count_what_surfaces_reflect_of_lamps():
-    shading = of_part(hollow(2).scene.parts[0])
-    np.testing.assert_allclose(reflection.fractions([shading], [DARK])[:, 0], [0.5, 0.25, 0.125], rtol=0.03)
+ONE = np.ones((6, 8, 8))
+REGIONS = [
+    ({"panel": ONE}, "other than panel, bulb, rest, background"),
+    ({"a/b": ONE}, "a name of letters"),
+    ({"one": ONE, "two": ONE}, "add up to at most 1 in each texel, got 2"),
+    ({"sun": ONE[:, :4, :4]}, "must have the"),
+    ({"sun": 2 * ONE}, "must be from 0 to 1, got 2 to 2"),
+    ({"sun": np.nan * ONE}, "finite"),
+]
+GLOWING = {"floor": TexturedMaterial(roughness=0.6, metallic=0.0, emissive=1.0)}
+TURNED = {"bulb": PointLight("bulb", BULB.position, 1.0, axis=[0, -1, 0])}
+MATERIALS = [
+    (GLOWING, "'floor' was precomputed without emis"),
+    ({"bulb": PointLight("bulb", [0, 1, 0], 1.0)}, "point light 'bulb' was traced from"),
+    (TURNED, r"traced with the axis and cone of all directions, got \[0.0, -1.0, 0.0\], \(0.0"),
+    ({"sun": PointLight("sun", [0, 1, 0], 1.0)}, r"point lights must be among those of the scene, \['bulb'\]"),
+]
+
+
+def test_regions_that_are_none_and_lamps_that_were_not_precomputed_are_refused():
+    view = relit().picture_view()
+    for regions, words in REGIONS:
+        with pytest.raises(ValueError, match=words):
+            view.mix(DARK, regions=regions)
+    for materials, words in MATERIALS:
+        with pytest.raises(ValueError, match=words):
+            relit().radiance(DARK, eye=EYE, materials=materials)
+    with pytest.raises(ValueError, match="several named"):
+        Scene(scene().parts, point_lights=[PointLight("floor", [0, 1, 0])])
+    with pytest.raises(ValueError, match=r"positions must be \[p, 3\], got \[3\]"):
+        probes.sample(relit(), DARK, np.zeros(3))

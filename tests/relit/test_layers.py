@@ -32,6 +32,12 @@ def upper(count: int, seed: int) -> np.ndarray:
     return way / np.linalg.norm(way, axis=1, keepdims=True)
 
 
+@jax.jit
+def evaluated(brdf, wi, wo):
+    """Values of a BRDF, by one program."""
+    return brdf(wi, wo)
+
+
 def test_a_coat_is_that_of_the_text_of_the_extension():
     """KHR_materials_clearcoat: mix(base, coat, clearcoat F), F by Schlick from n.v; the coat is the D V of glTF 2.0."""
     wi, wo = upper(50, 0), upper(50, 1)
@@ -42,9 +48,9 @@ def test_a_coat_is_that_of_the_text_of_the_extension():
     cos_i, cos_o = wi[:, 2], wo[:, 2]
     v = 0.5 / (cos_i * np.sqrt(alpha2 + (1 - alpha2) * cos_o**2) + cos_o * np.sqrt(alpha2 + (1 - alpha2) * cos_i**2))
     fresnel = weight * (0.04 + 0.96 * (1 - cos_o) ** 5)
-    below = np.asarray(base(jnp.asarray(wi), jnp.asarray(wo)))
+    below = np.asarray(evaluated(base, wi, wo))
     expected = (1 - fresnel)[:, None] * below + (fresnel * d * v)[:, None]
-    got = ClearCoat(base, weight, rough)(jnp.asarray(wi), jnp.asarray(wo))
+    got = evaluated(ClearCoat(base, weight, rough), wi, wo)
     np.testing.assert_allclose(got, expected, rtol=2e-4)
     with pytest.raises(ValueError, match="clearcoat of ClearCoat must be"):
         ClearCoat(base, 1.5, rough)
@@ -88,11 +94,10 @@ def test_a_sheen_is_that_of_the_text_of_the_extension(roughness):
     assert error[~low].max() < ALBEDO
     assert error[low].max() < ALBEDO_AT_HORIZON
     value = fibers(wi, wo, roughness)[:, None]
-    wi, wo = jnp.asarray(wi), jnp.asarray(wo)
-    np.testing.assert_allclose(Charlie(roughness)(wi, wo), value, rtol=2e-4, atol=1e-7)
+    np.testing.assert_allclose(evaluated(Charlie(roughness), wi, wo), value, rtol=2e-4, atol=1e-7)
     kept = 1 - color.max() * np.asarray(sheen_albedo(wo[:, 2], roughness))
-    expected = kept[:, None] * np.asarray(base(wi, wo)) + color * value
-    np.testing.assert_allclose(Sheen(base, color, roughness)(wi, wo), expected, rtol=2e-4)
+    expected = kept[:, None] * np.asarray(evaluated(base, wi, wo)) + color * value
+    np.testing.assert_allclose(evaluated(Sheen(base, color, roughness), wi, wo), expected, rtol=2e-4)
     with pytest.raises(ValueError, match="sheen_color of Sheen must be"):
         Sheen(base, 1.5 * color, roughness)
 
@@ -116,13 +121,17 @@ def test_tables_of_materials_under_layers_are_the_brdf(name):
     term = np.asarray(BASE.coefficient())
     weight = np.concatenate([(1 - share) * term, share * term, above[None]]) / table.scale[:, None]
     log_base, log_layer = np.log(np.float32([0.5, roughness]))
-    for angle in (0.1, 0.6, 1.1, 1.4):
-        wo = np.float32([[np.sin(angle), 0, np.cos(angle)]])
-        exact = np.asarray(brdf(jnp.asarray(wi), jnp.broadcast_to(wo, wi.shape))) * wi[:, 2:]
-        lobes = table.lobes(12).lookup(jnp.asarray(wo), jnp.asarray([log_base]), jnp.asarray([log_layer]))
+    made, wi = table.lobes(12), jnp.asarray(wi)
+
+    @jax.jit
+    def both(wo):
+        lobes = made.lookup(wo, jnp.asarray([log_base]), jnp.asarray([log_layer]))
         wide = [jnp.broadcast_to(each, (*each.shape[:-1], len(wi))) for each in vars(lobes).values()]
-        ours = np.asarray(type(lobes)(*wide).evaluate(jnp.asarray(wi))).T @ weight
-        assert np.linalg.norm(light.T @ (ours - exact)) < TABLE * np.linalg.norm(light.T @ exact)
+        return type(lobes)(*wide).evaluate(wi), brdf(wi, jnp.broadcast_to(wo, wi.shape)) * wi[:, 2:]
+
+    for angle in (0.1, 0.6, 1.1, 1.4):
+        value, exact = map(np.asarray, both(jnp.float32([[np.sin(angle), 0, np.cos(angle)]])))
+        assert np.linalg.norm(light.T @ (value.T @ weight - exact)) < TABLE * np.linalg.norm(light.T @ exact)
 
 
 @pytest.mark.parametrize("table", [standard.COATED, standard.SHEENED], ids=["coat", "sheen"])
@@ -299,40 +308,60 @@ def test_layers_that_were_not_precomputed_are_nan_where_they_are_traced():
     assert np.isnan(radiance(0.0, 0.5)).all()
 
 
-@pytest.mark.parametrize("names", [("coat", "green"), ("velvet",)], ids=["coat", "sheen"])
-def test_relit_scenes_with_layers_can_be_saved(names, tmp_path):
-    relit, material = precomputed(*names), MATERIALS[names[0]]
+def test_relit_scenes_with_layers_can_be_saved(tmp_path):
+    relit, light = precomputed("velvet"), builtin.studio(size=16)
     prt.files.save(tmp_path / "saved", relit)
-    again, light = prt.files.load(tmp_path / "saved"), builtin.studio(size=16)
-    eye = EYE
-    np.testing.assert_array_equal(again.radiance(light, eye=eye), relit.radiance(light, eye=eye))
-    new = {"ball 0": dataclasses.replace(material, roughness=0.3)}
-    changed = again.radiance(light, eye=eye, materials=new)
-    np.testing.assert_array_equal(changed, relit.radiance(light, eye=eye, materials=new))
+    again, new = prt.files.load(tmp_path / "saved"), {"ball 0": dataclasses.replace(VELVET, roughness=0.3)}
+    changed = again.radiance(light, eye=EYE, materials=new)
+    np.testing.assert_array_equal(changed, relit.radiance(light, eye=EYE, materials=new))
 
 
 def test_another_transmission_or_opacity_is_refused():
     glass = TexturedMaterial(0.5, 0.0, 0.4, transmission=0.5)
-    relit = prt.precompute(spheres(glass), refine=False, system="lobe", size=16, progress=False)
-    light = builtin.studio(size=16)
+    part = spheres(glass).parts[0]
+    opaque = dataclasses.replace(glass, transmission=0.0)
+    hole = dataclasses.replace(glass, alpha_mode="blend", alpha=0.5)
     for new, text in (
-        (dataclasses.replace(glass, transmission=0.0), r"a transmission of 0\.5, got a material of 0"),
-        (
-            dataclasses.replace(glass, alpha_mode="blend", alpha=0.5),
-            "the alpha mode 'opaque' and .*, got a material of 'blend'",
-        ),
+        (opaque, r"a transmission of 0\.5, got a material of 0"),
+        (hole, "the alpha mode 'opaque' and .*, got a material of 'blend'"),
     ):
         with pytest.raises(ValueError, match=f"part 'ball 0' was precomputed with {text}"):
-            relit.radiance(light, eye=EYE, materials={"ball 0": new})
+            channels.appearance(part, channels.of_part(part), new)
 
 
-def test_a_clear_coat_hides_a_sheen_with_a_warning():
-    both = dataclasses.replace(COATED, sheen_color=jnp.ones(3), sheen_roughness=0.3)
-    with pytest.warns(UserWarning, match="the sheen of part 'ball 0' is left out: it has a clear coat"):
-        shading = channels.of_part(spheres(both).parts[0])
-    alone = channels.of_part(spheres(COATED).parts[0])
-    assert shading.table is standard.COATED
-    np.testing.assert_allclose(shading.blend.weight, alone.blend.weight, rtol=1e-5)
+BRUSHED = dataclasses.replace(COATED, anisotropy=0.5)
+OMISSIONS = {
+    "a coat hides a sheen": (
+        dataclasses.replace(COATED, sheen_color=jnp.ones(3), sheen_roughness=0.3),
+        "the sheen of part 'ball 0' is left out: it has a clear coat",
+        COATED,
+    ),
+    "no standard table": (
+        BRUSHED,
+        "the clear coat of part 'ball 0' is left out",
+        dataclasses.replace(BRUSHED, clearcoat=0.0),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", OMISSIONS)
+def test_layers_are_left_out_with_a_warning(name):
+    material, words, shown = OMISSIONS[name]
+    with pytest.warns(UserWarning, match=words):
+        shading = channels.of_part(spheres(material).parts[0])
+    alone = channels.of_part(spheres(shown).parts[0])
+    assert shading.table is alone.table
+    np.testing.assert_allclose(shading.blend.weight, alone.blend.weight, rtol=1e-4)
+
+
+def test_pictures_are_without_a_coat_that_is_left_out():
+    light, scene = builtin.studio(size=16), spheres(COATED)
+    camera = prt.scene.camera.orbit(scene.mesh, width=32, height=32)
+    with pytest.warns(UserWarning, match="the clear coat of part 'ball 0' is left out"):
+        relit = prt.precompute(scene, refine=False, system=prt.relit.Harmonics(5), size=16, progress=False)
+    bare = {"ball 0": dataclasses.replace(COATED, clearcoat=0.0)}
+    pictures = [relit.picture(light, camera, materials=materials) for materials in (None, bare)]
+    np.testing.assert_allclose(*pictures, rtol=1e-3, atol=1e-4)
 
 
 def test_pages_show_the_base_with_a_warning():
@@ -345,25 +374,6 @@ def test_pages_show_the_base_with_a_warning():
     assert float(bare.scene.parts[0].material.clearcoat) == 0
     assert bare.shading[0].table is standard.METALLIC_ROUGHNESS
     assert bare.part_system(0).system.brdf.lobes == relit.part_system(0).system.brdf.lobes // 2
-
-
-def test_materials_without_standard_tables_lose_their_coat_with_a_warning():
-    brushed = dataclasses.replace(COATED, anisotropy=0.5)
-    with pytest.warns(UserWarning, match="the clear coat of part 'ball 0' is left out"):
-        shading = channels.of_part(spheres(brushed).parts[0])
-    assert shading.table is None
-    bare = channels.of_part(spheres(dataclasses.replace(brushed, clearcoat=0.0)).parts[0])
-    np.testing.assert_allclose(shading.blend.weight, bare.blend.weight, rtol=1e-4)
-
-
-def test_pictures_are_without_a_coat_that_is_left_out():
-    plain, light = spheres(dataclasses.replace(COATED, clearcoat=0.0)), builtin.studio(size=16)
-    camera = prt.scene.camera.orbit(plain.mesh, width=32, height=32)
-    options = {"refine": False, "system": prt.relit.Harmonics(degree=5), "size": 16, "progress": False}
-    with pytest.warns(UserWarning, match="the clear coat of part 'ball 0' is left out"):
-        coated = prt.precompute(spheres(COATED), **options)
-    pictures = [relit.picture(light, camera) for relit in (coated, prt.precompute(plain, **options))]
-    np.testing.assert_allclose(*pictures, rtol=1e-3, atol=1e-4)
 
 
 def test_materials_made_while_jax_traces_have_no_layers():

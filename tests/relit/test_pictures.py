@@ -8,7 +8,6 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 import numpy as np
-import OpenImageIO
 import pytest
 from jax._src import monitoring
 
@@ -67,13 +66,6 @@ def relit(system=None, bounces: int = 0) -> RelitScene:
     return prt.precompute(scene(), refine=False, system=system, size=SIZE, bounces=bounces, progress=False)
 
 
-def test_a_white_scene_in_a_white_light_is_white_to_its_edges():
-    white = scene(floor=Lambert(1.0), ball=Lambert(1.0))
-    ready = prt.precompute(Scene([white["ball"]]), refine=False, system=Lobes(4, 8), size=SIZE, progress=False)
-    picture = np.asarray(ready.picture(Environment(jnp.ones((6, SIZE, SIZE, 3))), CAMERA))
-    np.testing.assert_allclose(picture, 1, atol=0.03)
-
-
 def test_pixels_are_nearer_to_the_exact_ones_than_vertices_are():
     ready = relit()
     camera = dataclasses.replace(CAMERA, width=40, height=32)
@@ -90,29 +82,31 @@ def test_pixels_are_nearer_to_the_exact_ones_than_vertices_are():
     assert wrong(ready.picture(light(), camera)) < 0.06 < wrong(vertices)
 
 
-def test_textures_are_read_at_the_pixels():
-    # Two triangles in a light that is the same from everywhere: the picture is the texture.
-    square = make_mesh(SQUARE, np.array([[0, 1, 2], [0, 2, 3]]), texture=CORNERS)
-    ready = prt.precompute(
-        Scene([Part("square", square, matte())]), refine=False, system="lobe", size=SIZE, progress=False
-    )
-    above = Camera([0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0], 2 * np.arctan(0.5), 16, 16)
-    picture = ready.picture(Environment(jnp.ones((6, SIZE, SIZE, 3))), above, samples=1)
+def square(material: TexturedMaterial | Lambert) -> Scene:
+    """Two triangles."""
+    mesh = make_mesh(SQUARE, np.array([[0, 1, 2], [0, 2, 3]]), texture=CORNERS)
+    return Scene([Part("square", mesh, material)])
+
+
+def above(width: int) -> Camera:
+    """A camera whose height, of 16 pixels, the square fills."""
+    return Camera([0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0], 2 * np.arctan(0.5), width, 16)
+
+
+def white(strength: float = 1.0) -> Environment:
+    return Environment(jnp.full((6, SIZE, SIZE, 3), strength))
+
+
+def test_textures_are_read_at_the_pixels_and_averaged_where_they_are_far():
+    """In a light that is the same from everywhere the picture is the texture."""
+    ready = prt.precompute(square(matte()), refine=False, system=Lobes(4, texels=0), size=SIZE, progress=False)
+    picture = ready.picture(white(), above(16), samples=1)
     row = (np.arange(16) + 0.5) / 16
     place = np.stack(np.meshgrid(row, 1 - row), -1)
     np.testing.assert_allclose(picture, Texture(image()).at(jnp.asarray(place, jnp.float32)), atol=0.01)
-
-
-def test_far_textures_are_averaged():
-    square = make_mesh(SQUARE, np.array([[0, 1, 2], [0, 2, 3]]), texture=8 * CORNERS)
     checks = np.kron(np.indices((8, 8)).sum(0) % 2, np.ones((4, 4)))[..., None] * np.ones(3)
-    material = TexturedMaterial(metallic=0.0, specular=0.0, base_color_texture=Texture(checks))
-    ready = prt.precompute(
-        Scene([Part("square", square, material)]), refine=False, system="lobe", size=SIZE, progress=False
-    )
-    above = Camera([0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0], 2 * np.arctan(0.5), 8, 8)
-    picture = ready.picture(Environment(jnp.ones((6, SIZE, SIZE, 3))), above)
-    np.testing.assert_allclose(picture, 0.5, atol=0.02)
+    far = dataclasses.replace(matte(), base_color_texture=Texture(checks, 8 * np.eye(2, 3)))
+    np.testing.assert_allclose(ready.picture(white(), above(16), materials={"square": far}), 0.5, atol=0.02)
 
 
 def test_more_samples_are_nearer_to_a_picture_of_eight_times_the_size():
@@ -125,8 +119,6 @@ def test_more_samples_are_nearer_to_a_picture_of_eight_times_the_size():
     assert {each.shape for each in found} == {true.shape}
     one, four, sixteen = (np.linalg.norm(each - true) / np.linalg.norm(true) for each in found)
     assert 2 * sixteen < 1.2 * four < one
-    with pytest.raises(ValueError, match="samples must be 1, 4 or 16, got 9"):
-        ready.picture_view(CAMERA, samples=9)
 
 
 def test_pictures_go_through_programs_and_have_gradients(close):
@@ -165,10 +157,8 @@ def test_scenes_laid_over_devices_give_the_same_pictures(close):
 
 
 def test_exact_pixels_of_a_bare_square_are_closed_forms():
-    square = Part("square", make_mesh(SQUARE, np.array([[0, 1, 2], [0, 2, 3]])), Lambert(0.5))
-    ready = prt.precompute(Scene([square]), refine=False, system="harmonic", size=SIZE, progress=False)
-    white = [Environment(jnp.full((6, SIZE, SIZE, 3), each)) for each in (1.0, 3.0)]
-    exact = exact_pixels(ready.scene, ready.shading, white, CAMERA, pixels=40)
+    bare = square(Lambert(0.5))
+    exact = exact_pixels(bare, [channels.of_part(bare.parts[0])], [white(), white(3.0)], CAMERA, pixels=40)
     inside = np.isclose(exact.color[0, :, 0], 0.5, atol=1e-3)
     assert inside.mean() > 0.5
     assert np.all((exact.color[0] > 0.5 - 1e-3) & (exact.color[0] < 1 + 1e-3))
@@ -222,19 +212,14 @@ def test_exact_pixels_and_pictures_know_how_exact_they_are():
     assert 0.7 < picture.error[0] / many.relative_l2(picture.color[0])[0] < 2
 
 
-def whites(count: int = 1) -> list[Environment]:
-    return [Environment(jnp.full((6, SIZE, SIZE, 3), float(k))) for k in range(1, count + 1)]
-
-
 def test_the_exact_picture_of_a_texture_in_a_white_light_is_the_texture():
-    square = Part("square", make_mesh(SQUARE, np.array([[0, 1, 2], [0, 2, 3]]), texture=CORNERS), matte())
-    # The square fills the height of the picture, and all but two columns on either side.
-    above = Camera([0.0, 2.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0], 2 * np.arctan(0.5), CAMERA.width, CAMERA.height)
-    found = exact_picture(Scene([square]), [channels.of_part(square)], whites(2), above)
+    camera, textured = above(CAMERA.width), square(matte())
+    found = exact_picture(textured, [channels.of_part(textured.parts[0])], [white(), white(2.0)], camera)
     edge = (np.arange(256) + 0.5) / 256
     fine = Texture(image()).at(jnp.asarray(np.stack(np.meshgrid(edge, 1 - edge), -1), jnp.float32))
     mean = np.asarray(fine).reshape(16, 16, 16, 16, 3).mean((1, 3))
-    assert found.camera is above
+    assert found.camera is camera
+    # The square fills all but two columns on either side.
     assert np.linalg.norm(found.color[0][:, 2:-2] - mean) < 0.08 * np.linalg.norm(mean)
     np.testing.assert_allclose(found.color[1], 2 * found.color[0], rtol=1e-4)
 
@@ -328,38 +313,6 @@ def test_new_cameras_lights_materials_and_scenes_of_the_same_sizes_compile_nothi
     assert not events
 
 
-def test_the_number_of_programs_does_not_depend_on_the_number_of_parts():
-    counts = []
-    for parts in (3, 30):
-        scene = balls(parts)
-        jax.clear_caches()
-        with compiled() as events:
-            made(scene).picture(light(), CAMERA)
-        counts.append(len(events))
-    assert counts[1] <= counts[0] + 2
-    assert counts[1] <= 62  # with some small ones of the test's own cubemaps
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_points_that_are_none_are_refused():
-    face = np.array([[0, 1, 2]])
-    inside = np.full((1, 3), 1 / 3, np.float32)
-    with pytest.raises(ValueError, match="triangles must be from 0 to 0, got 1 to 1"):
-        on_triangles(face, np.array([1]), inside)
-    with pytest.raises(ValueError, match=r"weights of points must be at least 0 and sum to 1, got .* at point 0"):
-        on_triangles(face, np.array([0]), np.array([[1.2, -0.2, 0.0]]))
-    with pytest.raises(ValueError, match=r"weights of points must be at least 0 and sum to 1, got .*nan"):
-        on_triangles(face, np.array([0]), np.array([[np.nan, 0.5, 0.5]]))
-    with pytest.raises(ValueError, match=r"points must be triangles \[p\] and weights \[p, 3\]"):
-        on_triangles(face, np.array([0]), np.ones(3))
-    square, points = make_mesh(SQUARE, face), on_triangles(face, np.array([0]), inside)
-    with pytest.raises(ValueError, match="either vertices or points"):
-        prt.reference.radiance(square, SHARP, light(), eye=CAMERA.eye, vertex=np.array([0]), points=points)
-    alone = Points(jnp.zeros((1, 1), int), jnp.ones((1, 1)))
-    with pytest.raises(ValueError, match="three corners"):
-        visibility.point_starts(square, alone)
-
-
 def test_color_without_a_background_is_direct_plus_reflected_light(close):
     ready, names = relit(bounces=1), ["color", "direct", "reflected", "alpha"]
     layers = ready.picture(light(), CAMERA, background=None, layers=names)
@@ -375,8 +328,8 @@ def test_the_background_is_what_the_picture_adds_to_its_surfaces(close):
     bare = ready.picture(light(), CAMERA, background=None)
     behind = ready.picture(light(), CAMERA, background=sky) - bare[..., :3]
     close(ready.picture(light(), CAMERA, background=light()), ready.picture(light(), CAMERA), tolerance=1e-6)
-    white = ready.picture(light(), CAMERA, background=Environment(jnp.ones((6, SIZE, SIZE, 3)))) - bare[..., :3]
-    close(white, jnp.broadcast_to(1 - bare[..., 3:], white.shape), tolerance=1e-5)
+    added = ready.picture(light(), CAMERA, background=white()) - bare[..., :3]
+    close(added, jnp.broadcast_to(1 - bare[..., 3:], added.shape), tolerance=1e-5)
     assert float(jnp.max(jnp.abs(behind[bare[..., 3] == 1]))) < 1e-6
 
 
@@ -419,35 +372,6 @@ def test_albedo_is_the_texture_and_roughness_that_of_the_material():
     assert np.all(layers["albedo"][floor] <= texels.max(0) + 1e-5)
     assert np.std(layers["albedo"][floor], axis=0).min() > 0.01
     assert np.all(layers["albedo"][layers["alpha"] == 0] == 0)
-
-
-def test_layers_become_one_file_by_the_names_of_compositors(tmp_path):
-    layers = relit().picture(light(), CAMERA, background=None, layers=["color", "alpha", "depth", "normal", "part"])
-    prt.files.write_exr(tmp_path / "layers.exr", layers)
-    file = OpenImageIO.ImageInput.open(str(tmp_path / "layers.exr"))
-    assert file is not None
-    names = list(file.spec().channelnames)
-    assert names == ["R", "G", "B", "A", "Z", "normal.X", "normal.Y", "normal.Z", "part.V"]
-    values = np.asarray(file.read_image("float"))
-    np.testing.assert_array_equal(values[..., :3], np.asarray(layers["color"]))
-    np.testing.assert_array_equal(values[..., 4], np.asarray(layers["depth"]))
-    np.testing.assert_array_equal(values[..., 8], np.asarray(layers["part"]))
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "words"),
-    [
-        ({"layers": "color"}, TypeError, "layers must be a list"),
-        ({"layers": []}, ValueError, "layers must be different ones of color"),
-        ({"layers": ["color", "color"]}, ValueError, "layers must be different"),
-        ({"layers": ["beauty"]}, ValueError, "got 'beauty'"),
-        ({"background": "sky"}, ValueError, 'background must be "light"'),
-    ],
-    ids=str,
-)
-def test_layers_and_backgrounds_that_are_none_are_refused(options, error, words):
-    with pytest.raises(error, match=words):
-        relit().picture(light(), CAMERA, **options)
 
 
 def test_pictures_of_lights_and_cameras_are_those_of_a_loop(close):
@@ -505,15 +429,67 @@ def test_lights_of_another_size_are_refused_before_rays_and_programs(door, monke
     assert not events
 
 
-@pytest.mark.parametrize(
-    ("lights", "cameras", "error", "words"),
-    [
-        ([], [CAMERA], ValueError, "environments must be at least one"),
-        ([light()], [], ValueError, "cameras must be at least one"),
-        ([light()], [CAMERA, dataclasses.replace(CAMERA, width=9)], ValueError, "one size for one array, got 9 x 16"),
-    ],
-    ids=["no light", "no camera", "two sizes"],
-)
-def test_lights_and_cameras_that_are_none_are_refused(lights, cameras, error, words):
-    with pytest.raises(error, match=words):
-        relit().pictures(lights, cameras)
+def shown(**options):
+    """A picture with other options."""
+    return relit().picture(light(), CAMERA, **options)
+
+
+def point(triangle: int, weight: np.ndarray) -> Points:
+    return on_triangles(np.array([[0, 1, 2]]), np.array([triangle]), weight)
+
+
+INSIDE = np.full((1, 3), 1 / 3, np.float32)
+WRONG = [
+    (lambda: shown(layers="color"), TypeError, "layers must be a list"),
+    (lambda: shown(layers=[]), ValueError, "layers must be different ones of color"),
+    (lambda: shown(layers=["color", "color"]), ValueError, "layers must be different"),
+    (lambda: shown(layers=["beauty"]), ValueError, "got 'beauty'"),
+    (lambda: shown(background="sky"), ValueError, 'background must be "light"'),
+    (lambda: relit().picture_view(CAMERA, samples=9), ValueError, "samples must be 1, 4 or 16, got 9"),
+    (lambda: relit().pictures([], [CAMERA]), ValueError, "environments must be at least one"),
+    (lambda: relit().pictures([light()], []), ValueError, "cameras must be at least one"),
+    (
+        lambda: relit().pictures([light()], [CAMERA, dataclasses.replace(CAMERA, width=9)]),
+        ValueError,
+        "one size for one array, got 9 x 16",
+    ),
+    (lambda: point(1, INSIDE), ValueError, "triangles must be from 0 to 0, got 1 to 1"),
+    (
+        lambda: point(0, np.array([[1.2, -0.2, 0]])),
+        ValueError,
+        "points must be at least 0 and sum to 1, got .* at point 0",
+    ),
+    (lambda: point(0, np.array([[np.nan, 0.5, 0.5]])), ValueError, "points must be at least 0 and sum to 1, got .*nan"),
+    (lambda: point(0, np.ones(3)), ValueError, r"points must be triangles \[p\] and weights \[p, 3\]"),
+    (
+        lambda: prt.reference.radiance(
+            relit().mesh, SHARP, light(), eye=CAMERA.eye, vertex=np.array([0]), points=point(0, INSIDE)
+        ),
+        ValueError,
+        "either vertices or points",
+    ),
+    (
+        lambda: visibility.point_starts(relit().mesh, Points(jnp.zeros((1, 1), int), jnp.ones((1, 1)))),
+        ValueError,
+        "three corners",
+    ),
+]
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_layers_backgrounds_lights_cameras_and_points_that_are_none_are_refused():
+    for call, error, words in WRONG:
+        with pytest.raises(error, match=words):
+            call()
+
+
+def test_the_number_of_programs_does_not_depend_on_the_number_of_parts():
+    counts = []
+    for parts in (3, 30):
+        scene = balls(parts)
+        jax.clear_caches()
+        with compiled() as events:
+            made(scene).picture(light(), CAMERA)
+        counts.append(len(events))
+    assert counts[1] <= counts[0] + 2
+    assert counts[1] <= 62  # with some small ones of the test's own cubemaps

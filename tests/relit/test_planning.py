@@ -75,14 +75,10 @@ def ready(scene, planned):
 def test_the_error_asked_for_holds_from_other_views_and_under_another_light(scene, sky, planned, ready):
     assert planned.error * planning.MARGIN <= ASKED
     other = Environment(sky.radiance[:, ::-1] ** 0.8)
-    for light in (sky, other):
-        now, exact = [], []
-        for eye in VIEWS:
-            now.append(np.asarray(ready.radiance(light, eye=eye)))
-            parts = zip(scene.parts, ready.shading, strict=True)
-            options = {"eye": eye, "occluder": scene.mesh}
-            exact.append(np.concatenate([reference.radiance(s.mesh, s.exact, light, **options) for _, s in parts]))
-        assert np.linalg.norm(np.subtract(now, exact)) < 1.25 * ASKED * np.linalg.norm(exact)
+    for light, eye in zip((sky, other), VIEWS, strict=True):
+        now, options = ready.radiance(light, eye=eye), {"eye": eye, "occluder": scene.mesh}
+        exact = np.concatenate([reference.radiance(s.mesh, s.exact, light, **options) for s in ready.shading])
+        assert np.linalg.norm(now - exact) < 1.25 * ASKED * np.linalg.norm(exact)
 
 
 def test_the_report_has_the_error_of_every_part(scene, sky, planned, ready):
@@ -100,23 +96,20 @@ def test_the_report_has_the_error_of_every_part(scene, sky, planned, ready):
     assert str(found).count("off by") == 5
 
 
-def test_bytes_are_those_of_what_is_made(planned, ready):
-    assert planned.nbytes == pytest.approx(ready.nbytes, rel=0.2)
-    assert planned.seconds > 0
-
-
-def test_of_what_meets_the_error_at_the_rate_the_smallest_is_chosen(planned):
+def test_the_smallest_that_meets_the_error_at_the_rate_is_chosen(planned, ready):
     for group in planned.group:
         good = [each for each in group.considered if each.error * planning.MARGIN <= ASKED]
         assert group.chosen.nbytes == min(each.nbytes for each in good)
-
-
-def test_what_is_matte_is_lit_by_transfer_vectors(planned, ready):
+    assert planned.nbytes == pytest.approx(ready.nbytes, rel=0.2)
+    assert planned.seconds > 0
+    # What is matte is lit by transfer vectors, which need less than any lobes.
     assert isinstance(planned.recipes["ground"], Harmonics)
     assert isinstance(ready.part_system(1), prt.harmonic.DiffuseSystem)
+    considered = next(group.considered for group in planned.group if "ground" in group.names)
+    assert not any(isinstance(each.recipe, Lobes) for each in considered)
 
 
-def test_the_table_names_every_part_and_marks_one_choice_of_each(planned, tmp_path):
+def test_the_table_names_every_part_marks_one_choice_of_each_and_tells_what_bounces_bring(planned, tmp_path):
     table = str(planned)
     prt.files.save(tmp_path / "plan", planned)
     assert str(prt.files.load(tmp_path / "plan")) == table
@@ -125,6 +118,11 @@ def test_the_table_names_every_part_and_marks_one_choice_of_each(planned, tmp_pa
     assert f"in all: {100 * planned.error:.1f} %" in table
     assert "slower" not in table
     assert table.count("% of shadows between its vertices") == 3
+    assert planned.reflected.shape == (3, 3)
+    assert np.all(np.diff(planned.reflected, axis=0) < 0)
+    assert planned.bounces == 0
+    assert reflection.needed(planned.reflected, planned.reflected.max() - 1e-3) == 1
+    assert f"ground: {100 * planned.reflected[0, 1]:.1f} % of its light is reflected" in table
 
 
 def test_a_rate_that_nothing_reaches_takes_the_fastest_and_says_so(scene, sky):
@@ -133,11 +131,6 @@ def test_a_rate_that_nothing_reaches_takes_the_fastest_and_says_so(scene, sky):
     good = [each for each in found.group[0].considered if each.error * planning.MARGIN <= ASKED]
     assert found.group[0].chosen.seconds == min(each.seconds for each in good)
     assert "slower than the 1e+09 frames per second asked for" in str(found)
-
-
-def test_an_error_that_nothing_reaches_is_refused_with_the_best(scene, sky):
-    with pytest.raises(ValueError, match=r"error must be at least 0\.\d+ for part 'ball', which .* reaches; got 1e-05"):
-        prt.plan(prt.Scene([scene["ball"]]), refine=False, environments=[sky], error=1e-5, progress=False)
 
 
 def test_without_an_error_the_nearest_system_is_taken_with_a_warning(scene, sky, tmp_path, monkeypatch):
@@ -256,57 +249,34 @@ def test_a_plan_that_was_stopped_goes_on_with_what_was_measured(scene, sky, tmp_
     assert len(measured) == 2 * len(found.group[0].considered)
 
 
-def test_bounces_are_planned_by_what_they_bring(planned):
-    assert planned.reflected.shape == (3, 3)
-    assert np.all(np.diff(planned.reflected, axis=0) < 0)
-    assert planned.bounces == 0
-    more = planned.reflected.max() - 1e-3
-    assert reflection.needed(planned.reflected, more) == 1
-    assert f"ground: {100 * planned.reflected[0, 1]:.1f} % of its light is reflected" in str(planned)
-
-
 def test_a_scenes_own_lights_are_planned_for(scene, sky):
     assert measuring.lights_of(prt.Scene(scene.parts, environments=[sky])) == (sky,)
     assert len(measuring.lights_of(scene)) == 2
 
 
-@pytest.mark.parametrize(
-    ("lights", "options", "message"),
-    [
-        ([], {}, "environments must be at least one, got none"),
-        ([4, 8], {}, "must all have the same size"),
-        ([8], {"error": 0.0}, "error must be positive and finite, got 0"),
-        ([8], {"error": np.nan}, "error must be positive and finite, got nan"),
-        ([8], {"rate": np.inf}, "rate must be positive and finite, got inf"),
-    ],
-)
-def test_impossible_plans_are_refused(scene, lights, options, message):
-    lights = [Environment(jnp.ones((6, size, size, 3))) for size in lights]
-    with pytest.raises(ValueError, match=message):
-        prt.plan(scene, refine=False, environments=lights, progress=False, **options)
+WHITE = Environment(jnp.ones((6, 8, 8, 3)))
+DAMAGED = jax.tree.map(lambda each: each.at[2, 3, 4, 1].set(jnp.nan), WHITE)  # as a wrong computation makes it
+WRONG = [
+    ({"environments": []}, "environments must be at least one, got none"),
+    ({"environments": [WHITE, Environment(jnp.ones((6, 4, 4, 3)))]}, "must all have the same size"),
+    (
+        {"environments": [WHITE, DAMAGED]},
+        r"environment 1 must be finite, got 1 of 1152 .* first at \(2, 3, 4, 1\)",
+    ),
+    ({"environments": [WHITE, 3]}, "environment 1 must be of class Environment"),
+    ({"error": 0.0}, "error must be positive and finite, got 0"),
+    ({"error": np.nan}, "error must be positive and finite, got nan"),
+    ({"error": 1e-5}, r"error must be at least 0\.\d+ for part 'ground', which .* reaches; got 1e-05"),
+    ({"rate": np.inf}, "rate must be positive and finite, got inf"),
+]
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_plans_are_for_scenes_and_lights(scene, sky):
-    with pytest.raises(TypeError, match="scene must be of class Scene, which jaxprt"):
-        prt.plan(scene.mesh, refine=False, environments=[sky])
-    with pytest.raises(TypeError, match="environment 1 must be of class Environment"):
-        prt.plan(scene, refine=False, environments=[sky, 3])
-
-
-def test_a_light_that_is_not_finite_is_refused_by_its_number_among_others(scene):
-    whole = Environment(jnp.ones((6, 8, 8, 3)))
-    damaged = jax.tree.map(lambda each: each.at[2, 3, 4, 1].set(jnp.nan), whole)  # as a wrong computation makes it
-    with pytest.raises(ValueError, match=r"environment 1 must be finite, got 1 of 1152 .* first at \(2, 3, 4, 1\)"):
-        prt.plan(scene, refine=False, environments=[whole, damaged], progress=False)
-
-
-def test_a_brdf_that_is_not_finite_has_no_plan(scene, sky):
-    broken = prt.Scene([prt.Part("broken", scene["ball"].mesh, lambda wi, wo: jnp.nan * wi[..., :1])])
+def test_impossible_plans_are_refused(scene, sky):
+    ground, common = prt.Scene([scene["ground"]]), {"environments": [sky], "refine": False, "progress": False}
+    for options, message in WRONG:
+        with pytest.raises((TypeError, ValueError), match=message):
+            prt.plan(ground, **common | options)
+    broken = prt.Scene([prt.Part("broken", scene["ground"].mesh, lambda wi, wo: jnp.nan * wi[..., :1])])
     with pytest.raises(ValueError, match=r"the radiance that the BRDF reflects, .* must be finite, got"):
-        prt.plan(broken, refine=False, environments=[sky], progress=False)
-
-
-def test_lobes_are_left_out_where_less_than_they_need_is_enough(planned):
-    considered = next(group.considered for group in planned.group if "ground" in group.names)
-    assert not any(isinstance(each.recipe, Lobes) for each in considered)
+        prt.plan(broken, **common)

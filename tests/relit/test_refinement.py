@@ -49,16 +49,6 @@ def test_parts_cast_shadows_on_each_other_and_are_divided_alike_at_their_border(
     close(np.asarray(fine["left"].color), 1 + np.asarray(fine["left"].mesh.position))
 
 
-def test_without_lights_any_light_counts(scene):
-    fine = prt.refine(scene, error=0.03, vertices=2000, progress=False)
-    assert len(fine.mesh.position) > len(scene.mesh.position) + 10
-
-
-def test_an_open_scene_stays_as_it_is(light):
-    alone = Scene([Part("ground", square(-1, 1, 0), prt.brdf.Lambert(0.5))])
-    assert prt.refine(alone, error=0.0, vertices=50, environments=[light], progress=False) is alone
-
-
 def test_what_is_no_scene_is_refused(scene, light, unchecked):
     with pytest.raises(TypeError, match="the scene must be of class Scene"):
         prt.refine(scene.mesh)

@@ -14,7 +14,6 @@ import pytest
 import jaxprt as prt
 from jaxprt import bounces, lobe
 from jaxprt.relit import Lobes, RelitScene, casting, tracing
-from jaxprt.relit.tracing import facing
 from jaxprt.scene import Camera, Environment, Mesh, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.mesh import make_mesh
 from jaxprt.scene.points import on_triangles
@@ -115,7 +114,7 @@ def test_a_mirror_shows_a_wall_that_glows_where_the_closed_form_has_it():
     assert abs(disks[shown].mean() / color[shown].mean() - 1) < 0.5
 
 
-def test_points_pictures_and_programs_agree_with_the_vertices(close):
+def test_points_batches_and_programs_agree_with_the_vertices(close):
     ready = relit()
     color = ready.radiance(light(), eye=EYE)
     face = np.asarray(mesh("floor").face)
@@ -127,6 +126,8 @@ def test_points_pictures_and_programs_agree_with_the_vertices(close):
         np.asarray(mesh("floor").position)[vertex, 2] > -0.9
     )  # Where the wall stands on it, vertices start in front.
     close(whole[: len(face)][apart], np.asarray(color)[vertex[apart]], tolerance=0.02)
+    batch = relit().radiance(Environment(jnp.stack([light(2).radiance, light().radiance])), eye=EYE)
+    close(batch[1], color, tolerance=1e-5)
     # The eye is known inside of programs too, unless it is an argument.
     close(jax.jit(lambda each: ready.radiance(Environment(each), eye=EYE))(light().radiance), color, tolerance=1e-4)
     with pytest.raises(ValueError, match=re.escape("but the eye is traced by JAX: call RelitScene.view")):
@@ -160,13 +161,6 @@ def test_a_kept_view_gives_the_picture_of_every_light_and_of_the_closed_form(clo
     np.testing.assert_allclose(dark.reshape(-1, 3)[inside < -0.15], 0, atol=FAINT)
 
 
-def test_a_batch_of_lights_is_each_light_by_itself_with_rays_too(close):
-    batch = Environment(jnp.stack([light(1).radiance, light(2).radiance]))
-    colors = relit().radiance(batch, eye=EYE)
-    for number, seed in enumerate((1, 2)):
-        close(colors[number], relit().radiance(light(seed), eye=EYE), tolerance=1e-5)
-
-
 def test_light_is_linear_and_colors_have_the_gradient_of_finite_differences(close):
     ready, weight = relit(), np.random.default_rng(2).normal(size=(98, 3)).astype(np.float32)
     view = ready.view(EYE)
@@ -186,23 +180,17 @@ def test_light_is_linear_and_colors_have_the_gradient_of_finite_differences(clos
 
     step = 0.02
     finite = (colored(0.6 + step) - colored(0.6 - step)) / (2 * step)
-    close(jax.grad(colored)(0.6), finite, tolerance=0.01)
     close(jax.jit(jax.grad(colored))(0.6), finite, tolerance=0.01)
 
 
 def test_what_reflects_nothing_but_the_sky_shows_no_rays(close):
-    ball = builtin.sphere(rings=7, sectors=10)
-    alone = Scene([Part("ball", ball, mirror())])
-    ready = prt.precompute(alone, refine=False, system=Lobes(4, 0), size=SIZE, bounces=1, progress=False)
-    view = ready.view(EYE)
+    """From behind the wall the floor mirrors the sky alone, beside which harmonics would ring."""
+    eye = EYE * jnp.array([1.0, 1.0, -1.0])
+    view = relit().view(eye)
     assert view.reflected is not None
     assert view.reflected.hits == ()
-    direct = ready.without_bounces().radiance(light(), eye=EYE)
-    seen = np.asarray(facing(ready.mesh, EYE)) > 0
-    assert 0.3 < seen.mean() < 0.8
-    # Beside it harmonics ring.
-    close(np.asarray(ready.radiance(light(), eye=EYE))[seen], np.asarray(direct)[seen], tolerance=0.01)
-    assert np.isfinite(ready.picture(light(), CAMERA)).all()
+    color, direct = (each.radiance(light(), eye=eye)[:49] for each in (relit(), relit().without_bounces()))
+    close(color, direct, tolerance=0.01)
 
 
 def test_rough_parts_have_no_rays_and_bad_numbers_of_them_are_refused():

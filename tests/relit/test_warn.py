@@ -37,27 +37,26 @@ def seen(*mesh: Mesh, elevation: float = 0.3) -> list[str]:
 
 
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
-def test_inside_out_parts_are_named_at_any_size(size):
+def test_parts_that_are_inside_out_or_seen_from_below_are_named_at_any_size(size):
     scaled = eqx.tree_at(lambda each: each.position, BALL, BALL.position * size)
+    beside = eqx.tree_at(lambda each: each.position, scaled, scaled.position + np.float32([2.5 * size, 0, 0]))
     assert seen(scaled) == []
-    (text,) = seen(inside_out(scaled))
-    assert re.search("sees 100% of part '0' from behind, and backs are black: .* inside out", text)
+    (text,) = seen(scaled, inside_out(beside))
+    assert re.search("sees 100% of part '1' from behind, and backs are black: .* inside out", text)
+    plane = builtin.plane(cells=2)
+    assert [len(seen(plane, elevation=elevation)) for elevation in (0.5, -0.5)] == [0, 1]
 
 
-def test_only_the_part_that_is_inside_out_is_named():
-    beside = eqx.tree_at(lambda each: each.position, BALL, BALL.position + np.float32([2.5, 0, 0]))
-    (text,) = seen(BALL, inside_out(beside))
-    assert "part '1'" in text
-
-
-@pytest.mark.parametrize(("elevation", "count"), [(0.5, 0), (-0.5, 1)])
-def test_a_plane_is_named_from_below(elevation, count):
-    assert len(seen(builtin.plane(cells=2), elevation=elevation)) == count
-
-
-def test_lamps_may_be_seen_from_behind():
+def test_lamps_silhouettes_and_faces_of_both_orientations_are_not_named():
     scene = Scene([Part("lamp", builtin.plane(cells=2), TexturedMaterial(emissive=2.0))])
     assert told(warn.of_backs, scene, scene.mesh, orbit(scene.mesh, elevation=-0.5)) == []
+    both = make_mesh(
+        np.concatenate([np.asarray(BALL.position)] * 2),
+        np.concatenate([np.asarray(BALL.face), np.asarray(BALL.face)[:, ::-1] + len(BALL.position)]),
+        normal=np.concatenate([np.asarray(BALL.normal), -np.asarray(BALL.normal)]),
+    )
+    assert seen(both) == []
+    assert seen(builtin.chess()) == []
 
 
 def dome(*, radius=50.0, lowest=-1.0, outward=False) -> Mesh:
@@ -97,48 +96,29 @@ def test_a_room_with_a_lamp_asks_for_a_camera_inside():
     assert re.search("part '1' from behind, and backs are black: it encloses the scene, so give a camera inside", text)
 
 
-def test_faces_of_both_orientations_and_mere_silhouettes_are_not_named():
-    both = make_mesh(
-        np.concatenate([np.asarray(BALL.position)] * 2),
-        np.concatenate([np.asarray(BALL.face), np.asarray(BALL.face)[:, ::-1] + len(BALL.position)]),
-        normal=np.concatenate([np.asarray(BALL.normal), -np.asarray(BALL.normal)]),
-    )
-    assert seen(both) == []
-    assert seen(builtin.chess()) == []
-
-
-@pytest.mark.parametrize(
-    ("brdf", "gain"),
-    [
+def test_brdfs_that_create_light_are_named_and_wrong_values_refused():
+    for brdf, gain in (
         (Lambert(1.0), None),
         (Lambert((0.2, 1.5, 0.1)), "1.5"),
         (BlinnPhong(0.8, 0.9, 40.0), "1.27"),
         (GGX(1.0, 0.05), None),
         (MetallicRoughness(base_color=(200.0, 30.0, 20.0), metallic=0.0), "191"),
         (TexturedMaterial(base_color=1.0, metallic=0.0, roughness=0.1), None),
-    ],
-)
-def test_brdfs_that_create_light_are_named(brdf, gain):
-    part = Part("ball", BALL, brdf)
-    text = told(warn.of_gain, Scene([part]), [of_part(part)])
-    assert len(text) == (gain is not None)
-    assert gain is None or f"the BRDF of part 'ball' reflects {gain} times" in text[0]
+    ):
+        part = Part("ball", BALL, brdf)
+        text = told(warn.of_gain, Scene([part]), [of_part(part)])
+        assert len(text) == (gain is not None), brdf
+        assert gain is None or f"the BRDF of part 'ball' reflects {gain} times" in text[0]
+    for brdf, message in (
+        (lambda wi, wo: -wi[..., 2:], "must be finite and not negative"),
+        (lambda wi, wo: 0 * wi[..., 2:] + np.nan, "must be finite and not negative"),
+        (lambda wi, wo: 0.3, r"must return \[256, c\] for 256 directions, got \[\]"),
+    ):
+        with pytest.raises(ValueError, match=f"part 'ball': the BRDF {message}"):
+            prt.precompute(Scene([Part("ball", BALL, brdf)]), refine=False, system="lobe", size=4, progress=False)
 
 
 def test_precompute_warns_of_both():
     scene = Scene([Part("ball", inside_out(BALL), Lambert(1.5))])
     with pytest.warns(UserWarning, match="from behind"), pytest.warns(UserWarning, match=r"reflects 1\.5 times"):
         prt.precompute(scene, refine=False, system="harmonic", size=2, progress=False)
-
-
-@pytest.mark.parametrize(
-    ("brdf", "message"),
-    [
-        (lambda wi, wo: -wi[..., 2:], "must be finite and not negative"),
-        (lambda wi, wo: 0 * wi[..., 2:] + np.nan, "must be finite and not negative"),
-        (lambda wi, wo: 0.3, r"must return \[256, c\] for 256 directions, got \[\]"),
-    ],
-)
-def test_brdfs_of_wrong_values_are_refused(brdf, message):
-    with pytest.raises(ValueError, match=f"part 'ball': the BRDF {message}"):
-        prt.precompute(Scene([Part("ball", BALL, brdf)]), refine=False, system="lobe", size=4, progress=False)

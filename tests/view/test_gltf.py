@@ -151,28 +151,40 @@ def test_transfer_of_matrices_is_that_of_vectors(relit, tmp_path):
         view.export_gltf(made, tmp_path / "a.glb", degree=4)
 
 
-def test_others_read_the_file(path, relit):
-    read = trimesh.load(path, process=False)
+def test_others_read_the_file_and_jaxprt_its_materials(path, relit):
+    read, again = trimesh.load(path, process=False), prt.load_scene(path)
     assert sorted(read.geometry) == sorted(relit.scene.names)
-    for part in relit.scene.parts:
+    assert [part.name for part in again.parts] == list(relit.scene.names)
+    for part, other in zip(relit.scene.parts, again.parts, strict=True):
         mesh = read.geometry[part.name]
         np.testing.assert_allclose(mesh.vertices, part.mesh.position, atol=1e-6)
         facing = np.sum(mesh.face_normals * np.asarray(part.mesh.normal)[mesh.faces].sum(1), 1)
         assert np.all(facing[mesh.area_faces > 1e-6] > 0)
         assert mesh.vertex_attributes["_PRT_3"].shape == (len(mesh.vertices), 4)
-
-
-def test_scene_is_read_back_with_its_materials(path, relit):
-    read = prt.load_scene(path)
-    assert [part.name for part in read.parts] == list(relit.scene.names)
-    for part, other in zip(read.parts, relit.scene.parts, strict=True):
         for name in ("base_color", "metallic", "roughness", "specular"):
-            np.testing.assert_allclose(getattr(part.material, name), getattr(other.material, name), atol=1e-6)
-    textured, original = read.parts[0], relit.scene.parts[0]
-    np.testing.assert_allclose(
-        textured.material.base_color_texture.image, original.material.base_color_texture.image, atol=5e-3
-    )
+            np.testing.assert_allclose(getattr(other.material, name), getattr(part.material, name), atol=1e-6)
+    original, textured = relit.scene.parts[0], again.parts[0]
+    images = (part.material.base_color_texture.image for part in (textured, original))
+    np.testing.assert_allclose(*images, atol=5e-3)
     np.testing.assert_allclose(textured.mesh.texture, original.mesh.texture, atol=1e-6)
+
+
+def test_baked_colors_are_radiance_and_the_file_says_so(relit, light, tmp_path):
+    path, eye = tmp_path / "piece.glb", jnp.asarray([3.0, 1.0, 2.0])
+    exposure = view.export_baked(relit, path, light, eye=eye)
+    true = np.maximum(np.asarray(relit.radiance(light, eye=eye)), 0)
+    found = trimesh.load(path, process=False)
+    assert sorted(found.geometry) == sorted(f"{name}, baked for one light and one view" for name in relit.scene.names)
+    head, rows = content(path)
+    assert head["asset"]["extras"] == {"baked": True, "eye": [3.0, 1.0, 2.0], "exposure": exposure}
+    assert head["materials"][0]["extensions"] == {"KHR_materials_unlit": {}}
+    color = np.concatenate([rows(mesh["primitives"][0]["attributes"]["COLOR_0"]) for mesh in head["meshes"]])
+    np.testing.assert_allclose(exposure * color, true, rtol=1e-5, atol=1e-6)
+    assert color.max() <= 1
+    for name, mesh in found.geometry.items():
+        part = relit.scene[name.partition(",")[0]]
+        facing = np.sum(mesh.face_normals * np.asarray(part.mesh.normal)[mesh.faces].sum(1), 1)
+        assert np.all(facing[mesh.area_faces > 1e-6] > 0)
 
 
 def test_validator_of_khronos_has_no_objections(path, node_modules):
@@ -239,9 +251,10 @@ def test_a_file_without_transfer_is_told(browser, served, path, relit, light):
     tab.close()
 
 
-def test_what_a_file_cannot_hold_is_refused(relit, tmp_path):
-    with pytest.raises(ValueError, match=r"path must end in \.glb, .* got '.*a\.gltf'"):
-        view.export_gltf(relit, tmp_path / "a.gltf")
+def test_what_a_file_cannot_hold_is_refused(relit, light, tmp_path):
+    for export in (view.export_gltf, functools.partial(view.export_baked, environment=light)):
+        with pytest.raises(ValueError, match=r"path must end in \.glb, .* got '.*a\.gltf'"):
+            export(relit, tmp_path / "a.gltf")
     with pytest.raises(ValueError, match="degree must be between 0 and 5, got 6"):
         view.export_gltf(relit, tmp_path / "a.glb", degree=6)
     assert not list(tmp_path.iterdir())

@@ -210,7 +210,7 @@ def strip(hand):
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(text.partition(",")[2]))).convert("RGB")).astype(float)
 
 
-def test_a_sun_lands_where_the_mouse_is_in_the_turned_light(hand):
+def test_a_sun_lands_where_the_mouse_is_in_the_turned_light_and_a_drag_paints(hand):
     typed(hand, "rotation °", "-135")
     hand.page.wait_for_timeout(500)
     before = strip(hand)
@@ -234,6 +234,11 @@ def test_a_sun_lands_where_the_mouse_is_in_the_turned_light(hand):
     height, width = brighter.shape
     assert abs((column + 0.5) / width - u) < 0.05
     assert abs((row + 0.5) / height - v) < 0.08
+    hand.drag((box["x"] + 20, box["y"] + 40), (box["x"] + 120, box["y"] + 40), steps=10)
+    assert len(hand.state()["lamps"]) > 3
+    hand.page.get_by_role("button", name="remove suns").click()
+    hand.settle()
+    assert hand.state()["lamps"] == []
 
 
 def test_the_hint_goes_away_at_first_use_and_every_key_of_the_help_acts(hand):
@@ -275,23 +280,20 @@ def test_keys_that_change_nothing_leave_the_picture_at_rest(browser, systems, li
     server.close()
 
 
-@pytest.mark.parametrize("number", [0, 1])
-def test_it_starts_at_the_automatic_exposure_of_the_object(hand, systems, lights, number):
-    if number:
-        hand.page.locator("canvas.canvas").focus()
-        hand.page.keyboard.press("l")
-        hand.settle()
-    state, view_of = hand.state(), hand.camera()
-    scene = systems["lobes"]
+def test_it_starts_at_the_automatic_exposure_of_the_object_in_each_light(hand, systems, lights):
+    scene, view_of = systems["lobes"], hand.camera()
     height, width = 96, round(96 * hand.pixels().shape[1] / hand.pixels().shape[0])
     camera = Camera(view_of["eye"], view_of["target"], [0.0, 1.0, 0.0], view_of["angle"], width, height)
-    light = list(lights.values())[number]
-    color = scene.radiance(light, eye=np.asarray(view_of["eye"]))
     hidden = sides.hidden_backs(scene.scene)[np.asarray(scene.mesh.region)[np.asarray(scene.mesh.face)[:, 0]]]
-    picture = image.render(seen_from_front(scene.mesh, camera, hidden), color, camera)
-    expected = float(image.automatic_exposure(picture, coverage=scene.coverage(camera)))
-    assert state["light"] == number
-    assert state["stops"] == pytest.approx(expected, abs=EXPOSURE)
+    mesh, cover = seen_from_front(scene.mesh, camera, hidden), scene.coverage(camera)
+    hand.page.locator("canvas.canvas").focus()
+    for number, light in enumerate(lights.values()):
+        color = scene.radiance(light, eye=np.asarray(view_of["eye"]))
+        expected = float(image.automatic_exposure(image.render(mesh, color, camera), coverage=cover))
+        assert hand.state()["light"] == number
+        assert hand.state()["stops"] == pytest.approx(expected, abs=EXPOSURE)
+        hand.page.keyboard.press("l")
+        hand.settle()
 
 
 def saved(hand, width, height, *, transparent):
@@ -364,8 +366,8 @@ def test_the_dialog_opens_with_what_was_saved_last_and_without_what_was_canceled
     assert shown() == first
     assert page.locator("dialog .note").text_content() == ""
     cancel.click()
-    saved(hand, 20, 10, transparent=True)
-    assert shown() == ("20", "10", True)
+    saved(hand, 50, 30, transparent=True)
+    assert shown() == ("50", "30", True)
     cancel.click()
 
 

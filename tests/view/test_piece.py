@@ -17,12 +17,13 @@ from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, Part, PointLight, Scene, TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
 from jaxprt.sphere import cubemap, harmonics
-from jaxprt.view import messages, page_error, stages
+from jaxprt.view import messages, stages
 from jaxprt.view.content import scene_content
 from jaxprt.view.reduced import PageScene
 
 pytestmark = pytest.mark.filterwarnings("ignore:the page has light of bounces in part")
 
+LEFT_OUT = "light of bounces in part: these parts reflect it diffusely, without highlights: 'ball'$"
 SHOWN = 'mount(document.getElementById("viewer"), answers(content, buffers));'
 ASKED = """async (message) => {
   const { content, buffers } = await window.ask(message, message.file ? [Uint8Array.from(message.file).buffer] : []);
@@ -37,7 +38,8 @@ HALF = 2e-3  # of what arrives, in half floats, and of colors
 @pytest.fixture(scope="module")
 def made(systems, lights, tmp_path_factory):
     path = tmp_path_factory.mktemp("piece") / "ball.html"
-    return view.export(systems["lobes"], path, environments=lights)
+    with pytest.warns(UserWarning, match=LEFT_OUT):
+        return view.export(systems["lobes"], path, environments=lights)
 
 
 class Page:
@@ -197,8 +199,7 @@ def test_error_is_of_pictures_in_the_light_with_the_largest(made, systems, light
     assert made.nbytes == made.path.stat().st_size
 
 
-def test_causes_are_what_the_page_lacks(made, systems, lights):
-    scene, light = systems["lobes"].without_bounces(), lights["lamp"]
+def test_larger_errors_and_sizes_than_accepted_are_refused_with_their_causes(systems, lights, made, tmp_path):
     causes = {cause.name: cause for cause in made.causes}
     assert list(causes) == sorted(causes, key=lambda name: -causes[name].error)
     assert set(causes) == {"shadows", "bounces", "visibility"}
@@ -207,22 +208,25 @@ def test_causes_are_what_the_page_lacks(made, systems, lights):
     assert causes["shadows"].part == "ground"
     assert causes["shadows"].error == pytest.approx(made.error, rel=0.1)
     assert "shadows that lie between vertices" in str(causes["shadows"])
-    page = PageScene.of(scene).reduced(2, texels=True)
-    alone = page_error.measure(scene, page, {"lamp": light})
-    assert {cause.name for cause in alone.causes} == {"shadows", "visibility"}
+    for options, refusal in (
+        ({"error": 0.05}, r"error must be at least 0\.\d+ for this page, got 0\.05: .*'lamp'[^$]*on part 'ground'"),
+        ({"error": -1.0}, r"error must be at least 0 .*, got -1.0"),
+        ({"most": 1000}, "the size of the page with the coarsest visibility, got 1000"),
+    ):
+        with pytest.raises(ValueError, match=refusal):
+            view.export(systems["lobes"], tmp_path / "a.html", environments=lights, **options)
+        assert not (tmp_path / "a.html").exists()
 
 
-def test_larger_errors_than_accepted_are_refused_with_their_causes(systems, lights, made, tmp_path):
-    path = tmp_path / "a.html"
-    refusal = r"error must be at least 0\.\d+ for this page, got 0\.05: .*'lamp'"
-    with pytest.raises(ValueError, match=refusal) as refused:
-        view.export(systems["lobes"], path, environments=lights, error=0.05)
-    assert "most of it on part 'ground'" in str(refused.value)
-    assert not path.exists()
-    accepted = view.export(systems["lobes"], path, environments=lights, error=made.error)
-    assert accepted.error == made.error
-    with pytest.raises(ValueError, match=r"error must be at least 0 .*, got -1.0"):
-        view.export(systems["lobes"], path, environments=lights, error=-1.0)
+def test_size_that_is_asked_for_is_kept_and_bounces_that_are_none_cause_no_error(systems, lights, tmp_path):
+    scene = systems["lobes"].without_bounces()
+    lobes = [put(scene.part_system(number)).system for number in range(2)]  # without single texels
+    bare = RelitScene(scene.scene, scene.shading, Place.apart(scene.place.counts), lobes)
+    whole = view.export(bare, tmp_path / "a.html", environments={"lamp": lights["lamp"]})
+    assert {cause.name for cause in whole.causes} == {"shadows", "visibility"}
+    most = whole.nbytes - 2000
+    smaller = view.export(bare, tmp_path / "b.html", environments={"lamp": lights["lamp"]}, most=most)
+    assert (whole.edge, smaller.edge) == (2, 1)
 
 
 def test_page_asks_for_nothing(made):
@@ -259,11 +263,11 @@ def test_dropped_hdr_lights_the_page_as_it_lights_python(coding, page, systems, 
     assert off(found, np.asarray(true)) < 0.02
 
 
-@pytest.mark.parametrize(("name", "data"), [("a.hdr", b"no picture"), ("b.exr", b"v/1\x01"), ("c.hdr", b"")])
-def test_dropped_file_that_is_none_is_told(page, name, data, look):
-    content, _ = page.ask({"kind": "drop", "name": name, "file": list(data) or [0]})
-    assert content["kind"] == "error"
-    assert name in content["message"]
+def test_dropped_file_that_is_none_is_told(page, look):
+    for name, data in (("a.hdr", b"no picture"), ("b.exr", b"v/1\x01"), ("c.hdr", b"\0")):
+        content, _ = page.ask({"kind": "drop", "name": name, "file": list(data)})
+        assert content["kind"] == "error"
+        assert name in content["message"]
     assert page.color(look).any()
 
 
@@ -323,17 +327,6 @@ def test_matte_scene_needs_no_visibility(browser, lights, look, tmp_path):
     page.page.close()
 
 
-def test_size_that_is_asked_for_is_kept(systems, lights, made, tmp_path):
-    scene = systems["lobes"].without_bounces()
-    lobes = [put(scene.part_system(number)).system for number in range(2)]  # without single texels
-    bare = RelitScene(scene.scene, scene.shading, Layout.apart(scene.layout.counts), lobes)
-    whole = view.export(bare, tmp_path / "a.html", environments=lights)
-    smaller = view.export(bare, tmp_path / "b.html", environments=lights, most=whole.nbytes - 2000)
-    assert (whole.edge, smaller.edge) == (2, 1)
-    with pytest.raises(ValueError, match="the size of the page with the coarsest visibility, got 1000"):
-        view.export(systems["lobes"], tmp_path / "c.html", environments=lights, most=1000)
-
-
 def test_what_a_page_does_not_have_is_refused(systems, tmp_path):
     scene = systems["harmonics"]
     ball, ground = (put(scene.part_system(number)) for number in range(2))
@@ -354,13 +347,6 @@ def test_what_a_page_does_not_have_is_refused(systems, tmp_path):
     refused(skewed, "have a BRDF that is symmetric about the plane of the view")
     with pytest.raises(ValueError, match=r"path must end in \.html, .* got '.*a\.htm'"):
         view.export(systems["lobes"], tmp_path / "a.htm")
-
-
-def test_pages_say_which_reflections_they_leave_out(systems, tmp_path):
-    gray = {"gray": Environment(np.ones((6, 8, 8, 1)))}
-    words = "light of bounces in part: these parts reflect it diffusely, without highlights: 'ball'$"
-    with pytest.warns(UserWarning, match=words):
-        view.export(systems["lobes"], tmp_path / "a.html", environments=gray)
 
 
 @pytest.fixture(scope="module")

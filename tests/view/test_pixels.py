@@ -155,7 +155,6 @@ CASES = {
         prt.relit.Lobes(8, texels=2),
     ),
     "textured": (textured(), MATTE, prt.relit.Lobes(8, texels=2)),
-    "matte": (MATTE, MATTE, prt.relit.Lobes(8, texels=2)),
     "metal": (METAL, GLOSSY, prt.relit.Lobes(8, texels=2)),
     "harmonic": (GLOSSY, MATTE, prt.relit.Harmonics(2)),
 }

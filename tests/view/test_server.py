@@ -8,7 +8,6 @@ The address by which the browser comes: through a tunnel or a proxy, and not by 
 """
 
 import http.client
-import json
 import socket
 import struct
 import threading
@@ -29,9 +28,9 @@ WAYS = {
 }
 
 
-@pytest.fixture
-def server(session):
-    made = Server(session)
+@pytest.fixture(scope="module")
+def echo():
+    made = Server(Echo())
     yield made
     made.close()
 
@@ -49,76 +48,56 @@ def request(server, path, *, method="GET", body=None, **headers):
         connection.close()
 
 
-def test_the_page_and_its_module_are_served_and_nothing_is_fetched_from_elsewhere(server):
+def test_the_page_and_its_module_are_served_and_nothing_is_fetched_from_elsewhere(echo):
     for path, kind in (("", "text/html"), ("viewer.js", "text/javascript")):
-        status, headers, data = request(server, path)
+        status, headers, data = request(echo, path)
         assert (status, headers["Content-Type"].split(";")[0]) == (200, kind)
         assert "default-src 'self'" in headers["Content-Security-Policy"]
         assert b"http://" not in data
         assert b"https://" not in data
 
 
-def test_a_question_is_answered(server, look):
-    status, headers, data = request(server, "ask", method="POST", body=messages.pack(look, []))
-    content, buffers = messages.unpack(data)
+def test_a_question_is_answered(echo, look):
+    status, headers, data = request(echo, "ask", method="POST", body=messages.pack(look, [b"abc"]))
+    content, _ = messages.unpack(data)
     assert (status, headers["Content-Type"]) == (200, "application/octet-stream")
-    assert content["kind"] == "color"
-    assert len(buffers[0]) == 6 * content_vertices(server)
+    assert (content["kind"], content["came"], content["bytes"]) == ("color", list(look), [3])
 
 
-def content_vertices(server) -> int:
-    data = request(server, "ask", method="POST", body=messages.pack({"kind": "scene"}, []))[2]
-    return messages.unpack(data)[0]["vertices"]
+def test_wrong_tokens_and_pages_of_another_origin_get_nothing(echo):
+    address, body = urllib.parse.urlsplit(echo.url), messages.pack({"kind": "scene"}, [])
+    assert address.hostname == echo._server.server_address[0] == "127.0.0.1"
+    token = address.path.strip("/").encode()
+    for path in ("/", "/wrong/", "/wrong/viewer.js", "/wrong/ask", "/../"):
+        for method in ("GET", "POST"):
+            status, _, data = request(echo, path, method=method, body=body)
+            assert (status, b"lacks the viewer's token" in data, token in data) == (403, True, False)
+    for name, value in (
+        ("Origin", "https://example.org"),
+        ("Origin", "null"),
+        ("Host", "example.org"),
+        ("Host", "127.0.0.1:1"),
+    ):
+        for path, method in (("", "GET"), ("ask", "POST")):
+            status, found, data = request(echo, path, method=method, body=body, **{name: value})
+            assert (status, token in data, "Access-Control-Allow-Origin" in found) == (403, False, False)
 
 
-def test_the_server_is_of_this_machine_alone(server):
-    assert urllib.parse.urlsplit(server.url).hostname == "127.0.0.1"
-    assert server._server.server_address[0] == "127.0.0.1"
+def test_what_is_no_message_is_refused_and_the_server_goes_on(echo, look):
+    assert request(echo, "ask", method="POST", body=b"hello")[0] == 400
+    assert request(echo, "ask", method="POST", body=b"", Content_Length=str(1 << 30))[0] == 413
+    assert request(echo, "other")[0] == 404
+    assert request(echo, "other", method="POST", body=b"")[0] == 404
+    assert request(echo, "ask", method="POST", body=messages.pack(look, []))[0] == 200
 
 
-@pytest.mark.parametrize("path", ["/", "/wrong/", "/wrong/viewer.js", "/wrong/ask", "/../"])
-@pytest.mark.parametrize("method", ["GET", "POST"])
-def test_a_wrong_token_gets_403(server, path, method):
-    status, _, data = request(server, path, method=method, body=messages.pack({"kind": "scene"}, []))
-    assert status == 403
-    assert b"lacks the viewer's token" in data
-    assert urllib.parse.urlsplit(server.url).path.strip("/").encode() not in data
-
-
-@pytest.mark.parametrize(
-    "headers",
-    [{"Origin": "https://example.org"}, {"Origin": "null"}, {"Host": "example.org"}, {"Host": "127.0.0.1:1"}],
-)
-def test_pages_of_another_origin_get_nothing(server, headers):
-    for path, method in (("", "GET"), ("ask", "POST")):
-        status, found, data = request(server, path, method=method, body=messages.pack({"kind": "scene"}, []), **headers)
-        assert status == 403
-        assert "Access-Control-Allow-Origin" not in found
-        assert urllib.parse.urlsplit(server.url).path.strip("/").encode() not in data
-
-
-def test_what_is_no_message_is_refused_and_the_server_goes_on(server, look):
-    assert request(server, "ask", method="POST", body=b"hello")[0] == 400
-    assert request(server, "ask", method="POST", body=b"", Content_Length=str(1 << 30))[0] == 413
-    assert request(server, "other")[0] == 404
-    assert request(server, "other", method="POST", body=b"")[0] == 404
-    assert request(server, "ask", method="POST", body=messages.pack(look, []))[0] == 200
-
-
-def test_tokens_differ_and_ports_come_back(session):
-    first, second = Server(session), Server(session)
+def test_tokens_differ_and_ports_come_back():
+    first, second = Server(Echo()), Server(Echo())
     assert urllib.parse.urlsplit(first.url).path != urllib.parse.urlsplit(second.url).path
     port = urllib.parse.urlsplit(first.url).port
     first.close()
     second.close()
-    Server(session, port=port).close()
-
-
-@pytest.fixture(scope="module")
-def echo():
-    made = Server(Echo())
-    yield made
-    made.close()
+    Server(Echo(), port=port).close()
 
 
 @pytest.fixture
@@ -146,15 +125,9 @@ LOCAL = "Host: 127.0.0.1:{port}"
 GOOD = messages.pack({"kind": "look"}, [])
 HTTP = {
     "a length of 5,000 digits": ({"extra": ["Content-Length: " + "9" * 5000], "length": False}, 413, "at most"),
-    "a length of 5,000 zeros": ({"extra": ["Content-Length: " + "0" * 5000], "length": False}, 413, "at most"),
     "a negative length": ({"extra": ["Content-Length: -5"], "length": False}, 400, "whole number, got '-5'"),
-    "a signed length": ({"extra": ["Content-Length: +5"], "length": False}, 400, "whole number"),
     "a length in words": ({"extra": ["Content-Length: ten"], "length": False}, 400, "got 'ten'"),
-    "a length in superscript": ({"extra": ["Content-Length: \xb2"], "length": False}, 400, "whole number"),
-    "an empty length": ({"extra": ["Content-Length: "], "length": False}, 400, "whole number, got ''"),
-    "a fraction of a byte": ({"extra": ["Content-Length: 1.5"], "length": False}, 400, "got '1.5'"),
     "two lengths": ({"extra": ["Content-Length: 3"], "body": GOOD}, 400, "must have one Content-Length"),
-    "a list of lengths": ({"extra": ["Content-Length: 3, 3"], "length": False}, 400, "whole number, got '3, 3'"),
     "no length": ({"length": False}, 411, "must state its length by Content-Length alone, got none"),
     "chunks": (
         {"extra": ["Transfer-Encoding: chunked"], "length": False, "body": b"3\r\nabc\r\n0\r\n\r\n"},
@@ -162,12 +135,8 @@ HTTP = {
         "got Transfer-Encoding 'chunked'",
     ),
     "chunks and a length": ({"extra": ["Transfer-Encoding: chunked"], "body": GOOD}, 400, "Transfer-Encoding"),
-    "a length before a space": ({"extra": ["Content-Length : 3"], "length": False}, 400, "headers of the right form"),
-    "a terabyte": ({"extra": [f"Content-Length: {10**12}"], "length": False}, 413, f"got {10**12}"),
     "two hosts": ({"extra": ["Host: example.org"], "body": GOOD}, 400, "one Host"),
-    "the same host twice": ({"extra": [LOCAL], "body": GOOD}, 400, "one Host"),
     "no host": ({"host": "", "body": GOOD}, 400, "one Host"),
-    "an empty host": ({"host": "Host: ", "body": GOOD}, 403, "with the Host ''"),
     "another host": ({"host": "Host: example.org:80", "body": GOOD}, 403, "with the Host 'example.org:80'"),
     "a host of letters beyond ASCII": ({"host": "Host: \xe9\xe8", "body": GOOD}, 403, r"Host '\xe9\xe8'"),
     "two origins": (
@@ -177,7 +146,6 @@ HTTP = {
     ),
     "another origin": ({"extra": ["Origin: https://a.org"], "body": GOOD}, 403, "with the Origin 'https://a.org'"),
     "a header without a colon": ({"extra": ["Nonsense"], "body": GOOD}, 400, "headers of the right form"),
-    "a header of 100 kB": ({"extra": ["X: " + "a" * 100_000], "body": GOOD}, 431, "Line too long"),
     "200 headers": ({"extra": [f"X{number}: a" for number in range(200)], "body": GOOD}, 431, "Too many headers"),
     "a path of 100 kB": ({"path": "a" * 100_000, "body": GOOD}, 414, "Too Long"),
     "an unknown method": ({"method": "BREW", "body": GOOD}, 405, "Unsupported method"),
@@ -187,33 +155,21 @@ HTTP = {
 }
 
 
-@pytest.mark.parametrize("case", HTTP)
-def test_requests_of_wrong_form_get_a_status_and_words(echo, case):
-    options, status, words = HTTP[case]
-    port = str(urllib.parse.urlsplit(echo.url).port)
-    options = options | {"extra": [line.replace("{port}", port) for line in options.get("extra", ())]}
-    found, text = exchange(echo, raw_request(echo, **options))
-    assert (found, words in text) == (status, True), text
-    assert urllib.parse.urlsplit(echo.url).path.strip("/") not in text  # the token
-    assert alive(echo)
-
-
-@pytest.mark.parametrize(
-    ("data", "status"),
-    [
-        (b"\r\n\r\n", None),
-        (b"hello\r\n\r\n", 400),
-        (b"GET\r\n\r\n", 400),
-        (b"GET / HTTP/9.9\r\n\r\n", 400),
-        (b"GET / HTTP/x\r\n\r\n", 400),
-        (b"GET /\r\n\r\n", 400),
-        (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n", 400),  # TLS
-        (b"POST / HTTP/1.1\r\n\r\n", 400),
-    ],
-)
-def test_bytes_that_are_no_request_are_refused(echo, data, status):
-    if status is not None:
-        assert exchange(echo, data)[0] == status
+def test_requests_of_wrong_form_get_a_status_and_words(echo):
+    port, token = str(urllib.parse.urlsplit(echo.url).port), urllib.parse.urlsplit(echo.url).path.strip("/")
+    for case, (options, status, words) in HTTP.items():
+        options = options | {"extra": [line.replace("{port}", port) for line in options.get("extra", ())]}
+        found, text = exchange(echo, raw_request(echo, **options))
+        assert (found, words in text, token in text) == (status, True, False), (case, text)
+    for data in (
+        b"hello\r\n\r\n",
+        b"GET\r\n\r\n",
+        b"GET / HTTP/9.9\r\n\r\n",
+        b"GET /\r\n\r\n",
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03\r\n\r\n",  # TLS
+        b"POST / HTTP/1.1\r\n\r\n",
+    ):
+        assert exchange(echo, data)[0] == 400
     assert alive(echo)
 
 
@@ -225,56 +181,42 @@ def body(text, length=None):
 DEEP = "[" * 100_000
 BODIES = {
     "empty": (b"", "in another form"),
-    "short": (b"abc", "in another form"),
     "a length beyond the end": (body('{"content": {}, "lengths": []}', 2**32 - 1), "in another form"),
     "no JSON": (body("hello"), "in another form"),
     "no UTF-8": (body(b'{"content": {"kind": "\xff\xfe"}, "lengths": []}'), "in another form"),
-    "a list": (body("[]"), "in another form"),
-    "no content": (body('{"lengths": []}'), "in another form"),
     "content of pairs": (body('{"content": [["kind", "look"]], "lengths": []}'), "`content`"),
-    "no lengths": (body('{"content": {}}'), "in another form"),
-    "lengths of text": (body('{"content": {}, "lengths": "12"}'), "`lengths`"),
     "a negative array": (body('{"content": {}, "lengths": [-1]}'), "an array has -1 bytes"),
     "an array beyond the end": (body('{"content": {}, "lengths": [8]}'), "an array has 8 bytes"),
-    "an array of true bytes": (body('{"content": {}, "lengths": [true]}'), "an array has True bytes"),
     "nested lists": (body('{"content": {"kind": ' + DEEP), "in another form"),
-    "an integer beyond float64": (
-        body('{"content": {"kind": "look", "turn": 1' + "0" * 400 + '}, "lengths": []}'),
-        "in the range of float64",
-    ),
     "an integer of 5,000 digits": (
         body('{"content": {"turn": ' + "9" * 5000 + '}, "lengths": []}'),
         "in the range of float64, got 9999",
     ),
     "a float beyond float64": (body('{"content": {"turn": 1e999}, "lengths": []}'), "must be finite, got 1e999"),
     "not a number": (body('{"content": {"turn": NaN}, "lengths": []}'), "must be finite, got NaN"),
-    "infinity": (body('{"content": {"turn": -Infinity}, "lengths": []}'), "must be finite, got -Infinity"),
 }
 
 
-@pytest.mark.parametrize("case", BODIES)
-def test_messages_of_wrong_form_get_400_and_words(echo, case):
-    data, words = BODIES[case]
-    status, text = exchange(echo, raw_request(echo, body=data))
-    assert (status, words in text) == (400, True), text
+def test_messages_of_wrong_form_get_400_and_words_and_faults_500(echo):
+    for case, (data, words) in BODIES.items():
+        status, text = exchange(echo, raw_request(echo, body=data))
+        assert (status, words in text) == (400, True), (case, text)
+    for kind in ("fault", "nothing"):
+        status, text = exchange(echo, raw_request(echo, body=messages.pack({"kind": kind}, [])))
+        assert (status, "the viewer failed" in text) == (500, True)
     assert alive(echo)
 
 
-def test_an_answer_that_is_an_error_has_the_status_400_and_its_words(echo):
+def test_several_messages_go_over_one_connection_and_errors_have_status_400(echo):
+    whole = raw_request(echo, body=GOOD).replace(b"Connection: close\r\n", b"")
+    last = raw_request(echo, body=messages.pack({"kind": "wrong"}, []))
     place = urllib.parse.urlsplit(echo.url)
     with socket.create_connection((place.hostname or "", place.port or 0)) as connection:
-        connection.sendall(raw_request(echo, body=messages.pack({"kind": "wrong"}, [])))
+        connection.sendall(whole + whole + last)
         answer = b"".join(iter(lambda: connection.recv(1 << 16), b""))
-    head, _, data = answer.partition(b"\r\n\r\n")
-    assert head.startswith(b"HTTP/1.1 400 ")
-    assert messages.unpack(data)[0]["message"] == "what was required"
-
-
-@pytest.mark.parametrize("kind", ["fault", "nothing"])
-def test_a_fault_of_the_viewer_is_told_and_the_server_goes_on(echo, kind):
-    status, text = exchange(echo, raw_request(echo, body=messages.pack({"kind": kind}, [])))
-    assert (status, "the viewer failed" in text) == (500, True)
-    assert alive(echo)
+    assert answer.count(b"HTTP/1.1 200 ") == 2
+    head, _, data = answer[answer.index(b"HTTP/1.1 400 ") :].partition(b"\r\n\r\n")
+    assert messages.unpack(data)[0]["message"] == "what was required", head
 
 
 def test_a_message_that_stops_is_refused(echo, quick):
@@ -306,22 +248,6 @@ def test_a_large_message_is_refused_by_the_free_memory_before_it_is_read(echo, m
     data = messages.pack({"kind": "drop"}, [bytes(1 << 20)])
     status, text = exchange(echo, raw_request(echo, body=data))
     assert (status, "[1048576]" in text) == (200, True)
-
-
-def test_several_messages_go_over_one_connection(echo):
-    whole = raw_request(echo, body=GOOD).replace(b"Connection: close\r\n", b"")
-    last = raw_request(echo, body=GOOD)
-    place = urllib.parse.urlsplit(echo.url)
-    with socket.create_connection((place.hostname or "", place.port or 0)) as connection:
-        connection.sendall(whole + whole + last)
-        answer = b"".join(iter(lambda: connection.recv(1 << 16), b""))
-    assert answer.count(b"HTTP/1.1 200 ") == 3
-
-
-def test_integers_beyond_float64_are_refused_by_name_in_notebooks_too():
-    with pytest.raises(ValueError, match="turn must be a finite number, got an integer of 1329 bits"):
-        messages.number({"turn": 10**400}, "turn", 0.0, 1.0)
-    assert json.loads(json.dumps(1 << 999)) == messages.number({"turn": 1 << 999}, "turn", 0.0, float("inf"))
 
 
 @pytest.fixture(params=WAYS)
@@ -404,55 +330,28 @@ def test_the_refusal_says_which_host_came_which_are_served_and_which_option_help
     made.close()
 
 
-@pytest.mark.parametrize(
-    ("text", "hosts", "origin", "path"),
-    [
-        ("http://localhost:9000", ("localhost:9000",), "http://localhost:9000", ""),
-        ("http://localhost:9000/", ("localhost:9000",), "http://localhost:9000", ""),
-        ("https://Hub.Example.org/a/b/", ("hub.example.org", "hub.example.org:443"), "https://hub.example.org", "/a/b"),
-        ("https://hub.example.org:443", ("hub.example.org", "hub.example.org:443"), "https://hub.example.org", ""),
-        ("http://hub.example.org:443", ("hub.example.org:443",), "http://hub.example.org:443", ""),
-        ("http://[::1]:9000", ("[::1]:9000",), "http://[::1]:9000", ""),
-        ("http://10.0.0.5:80/x", ("10.0.0.5", "10.0.0.5:80"), "http://10.0.0.5", "/x"),
-    ],
-)
-def test_addresses_are_taken_apart_as_browsers_write_them(text, hosts, origin, path):
-    assert parse(text) == (f"{origin}{path}", hosts, origin, path)
-
-
-WRONG = [
-    "",
-    "localhost:9000",
-    "localhost",
-    "ftp://a",
-    "http://",
-    "http://*",
-    "http://a b",
-    "http://a/?x",
-    "http://a/#x",
+ADDRESSES = [
+    ("http://localhost:9000/", ("localhost:9000",), "http://localhost:9000", ""),
+    ("https://Hub.Example.org/a/b/", ("hub.example.org", "hub.example.org:443"), "https://hub.example.org", "/a/b"),
+    ("https://hub.example.org:443", ("hub.example.org", "hub.example.org:443"), "https://hub.example.org", ""),
+    ("http://hub.example.org:443", ("hub.example.org:443",), "http://hub.example.org:443", ""),
+    ("http://[::1]:9000", ("[::1]:9000",), "http://[::1]:9000", ""),
+    ("http://10.0.0.5:80/x", ("10.0.0.5", "10.0.0.5:80"), "http://10.0.0.5", "/x"),
 ]
-WRONG += [
-    "http://user@a",
-    "http://a:port",
-    "http://a:70000",
-    "http://a/\r\nX: y",
-    "http://a\x00",
-    "//a",
-    "http://[a",
-    "*",
-]
+WRONG = ["", "localhost:9000", "ftp://a", "http://", "http://*", "http://a b", "http://a/?x", "http://a/#x", "*"]
+WRONG += ["http://user@a", "http://a:port", "http://a:70000", "http://a/\r\nX: y", "http://a\x00", "//a", "http://[a"]
 WRONG += ["http://a/<script>", "http://a/\u00e9", "http://.", "http://-", "javascript:alert(1)"]
 
 
-@pytest.mark.parametrize("text", WRONG)
-def test_what_is_no_address_is_refused_before_anything_is_computed(text, monkeypatch):
-    with pytest.raises(ValueError, match="the address must be that in the browser's bar"):
-        parse(text)
-    with pytest.raises(ValueError, match="the address must be that"):
-        Server(Echo(), address=text)
-    monkeypatch.setattr(play, "prepare", None)
-    found = CliRunner().invoke(play.command, ["--address", text])
-    assert "--address: the address must be that in the browser's bar" in str(found.exception)
+def test_addresses_are_taken_apart_as_browsers_write_them_and_others_refused(monkeypatch):
+    for text, hosts, origin, path in ADDRESSES:
+        assert parse(text) == (f"{origin}{path}", hosts, origin, path)
+    monkeypatch.setattr(play, "prepare", None)  # before anything is computed
+    for text in WRONG:
+        with pytest.raises(ValueError, match="the address must be that in the browser's bar"):
+            Server(Echo(), address=text)
+        found = CliRunner().invoke(play.command, ["--address", text])
+        assert "--address: the address must be that in the browser's bar" in str(found.exception), text
 
 
 def test_the_command_line_prints_the_address_and_opens_no_browser(monkeypatch):

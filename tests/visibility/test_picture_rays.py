@@ -117,16 +117,16 @@ def test_places_within_a_texel_follow_the_flux_of_the_finer_light():
     assert mean @ area / np.linalg.norm(mean) / np.linalg.norm(area) > 1 - 1e-4
 
 
-def test_places_in_texels_are_means_and_widths_of_the_finer_flux():
+def test_spots_in_texels_are_means_and_widths_of_the_finer_flux():
     texel, factor = np.array([3, 5 * SIZE**2 + 2 * SIZE + 1]), 4
     even = np.ones((6, factor * SIZE, factor * SIZE, 1))
-    np.testing.assert_allclose(light_samples.places_in_texels(texel, even, size=SIZE), [[0, 0, 1, 1]] * 2, atol=1e-12)
+    np.testing.assert_allclose(light_samples.spots_in_texels(texel, even, size=SIZE), [[0, 0, 1, 1]] * 2, atol=1e-12)
     np.testing.assert_allclose(
-        light_samples.places_in_texels(texel, 0 * even, size=SIZE), [[0, 0, 1, 1]] * 2, atol=1e-12
+        light_samples.spots_in_texels(texel, 0 * even, size=SIZE), [[0, 0, 1, 1]] * 2, atol=1e-12
     )
     spot = np.zeros_like(even)
     spot[5, 2 * factor, factor + 3] = 7  # the first row and the last column of the second texel
-    found = light_samples.places_in_texels(texel[1:], spot, size=SIZE)
+    found = light_samples.spots_in_texels(texel[1:], spot, size=SIZE)
     np.testing.assert_allclose(found, [[0.75, -0.75, 0.25, 0.25]], atol=1e-12)
 
 
