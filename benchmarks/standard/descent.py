@@ -46,9 +46,9 @@ class Change(eqx.Module):
     """
 
     shift: Float[Array, "3 l *q"]
-    scale: Float[Array, "l *q"]
+    scale: Float[Array, " l *q"]
     weight: Float[Array, "c l *q"]
-    diffuse: Float[Array, "c *q"]
+    diffuse: Float[Array, " c *q"]
 
 
 class Views(eqx.Module):
@@ -73,7 +73,7 @@ def improve(
     table: LobeBrdf,
     family: Callable,
     weight: Float[np.ndarray, "n k"],
-    least: Float[np.ndarray, "l *q"],
+    least: Float[np.ndarray, " l *q"],
     *,
     first: float,
     steps: int,

@@ -95,7 +95,9 @@ def among(
     return [neighbors(place(knot, value), size=len(knot)) for knot, value in zip(knots, parameter, strict=True)]
 
 
-def read(row: Float[Array, "r *q"], axis: Sequence[tuple[Int[Array, " v"], Float[Array, " v"]]]) -> Float[Array, "r v"]:
+def read(
+    row: Float[Array, " r *q"], axis: Sequence[tuple[Int[Array, " v"], Float[Array, " v"]]]
+) -> Float[Array, "r v"]:
     """Rows of a table, interpolated multilinearly along each axis of nodes."""
     count = len(axis[0][0])
     spot, weight = jnp.zeros((1, count), jnp.int32), jnp.ones((1, count), axis[0][1].dtype)

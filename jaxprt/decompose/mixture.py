@@ -83,7 +83,7 @@ def drop(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
 
 
 @partial(jit, static_argnames=("degree",))
-def bands(concentration: Float[Array, "*b"], *, degree: int) -> Float[Array, "l *b"]:
+def bands(concentration: Float[Array, "*b"], *, degree: int) -> Float[Array, " l *b"]:
     """Factors by which convolution with a von Mises-Fisher lobe scales each band of spherical harmonics.
 
         A_l = i_l(k) / i_0(k),    A_0 = 1,    A_1 = coth k - 1 / k,    A_(l+1) = A_(l-1) - (2 l + 1) / k A_l

@@ -57,7 +57,7 @@ class Pixels(eqx.Module):
     barycentric: Float[Array | np.ndarray, "p 3"]
     slope: Float[Array | np.ndarray, "p 2 3"]
     pixel: Int[Array | np.ndarray, " p"]
-    coverage: Float[Array | np.ndarray, "p *c"]
+    coverage: Float[Array | np.ndarray, " p *c"]
     background: Float[Array, "h w *c"]
 
 
@@ -128,7 +128,7 @@ def shading_points(
 
 @jit
 def interpolate(
-    fragments: Fragments | Pixels, face: Int[Array, "f 3"], attribute: Float[Array, "v *c"]
+    fragments: Fragments | Pixels, face: Int[Array, "f 3"], attribute: Float[Array, " v *c"]
 ) -> Float[Array, "..."]:
     """Interpolates a vertex attribute to pixels or to shading points.
 

@@ -175,7 +175,7 @@ class Edges:
         return low * self._vertices + high
 
 
-def middle(value: Float[np.ndarray, "v *c"], parent: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, "n *c"]:
+def middle(value: Float[np.ndarray, " v *c"], parent: Int[np.ndarray, "n 2"]) -> Float[np.ndarray, " n *c"]:
     """Values at the midpoints between vertices, in the type of the values."""
     return value[parent].mean(1)
 

@@ -73,7 +73,7 @@ def evaluate(direction: Num[Array, "*b 3"], *, degree: int) -> Float[Array, "*b 
 
 
 @jit
-def reconstruct(coefficient: Float[Array, "lm *c"], direction: Float[Array, "*b 3"]) -> Float[Array, "..."]:
+def reconstruct(coefficient: Float[Array, " lm *c"], direction: Float[Array, "*b 3"]) -> Float[Array, "..."]:
     """Reconstructs the function given by SH coefficients, for given directions.
 
     Args:
@@ -91,7 +91,7 @@ def reconstruct(coefficient: Float[Array, "lm *c"], direction: Float[Array, "*b 
 
 
 @functools.partial(jit, static_argnames="degree")
-def project(radiance: Num[Array, "6 n n *c"], *, degree: int) -> Float[Array, "lm *c"]:
+def project(radiance: Num[Array, "6 n n *c"], *, degree: int) -> Float[Array, " lm *c"]:
     """SH coefficients of a cubemap: the integral of basis times radiance over the sphere.
 
     Radiance is constant over each texel. The basis functions are integrated over the texel's solid angle by Gauss
@@ -267,7 +267,7 @@ def quadrature(degree: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @jit
-def convolve(coefficient: Float[Array, "lm *c"], factor: Float[Array, " l"]) -> Float[Array, "lm *c"]:
+def convolve(coefficient: Float[Array, " lm *c"], factor: Float[Array, " l"]) -> Float[Array, " lm *c"]:
     """Multiplies every band by the factor of a zonal kernel or a window.
 
     Args:
@@ -335,7 +335,7 @@ def natural(*, degree: int) -> Float[Array, " l"]:
     return 1 / (jnp.arange(degree + 1) + 0.5)
 
 
-def least_laplacian(coefficient: Float[Array, "lm *c"], share: Float[Array, ""]) -> Float[Array, " l"]:
+def least_laplacian(coefficient: Float[Array, " lm *c"], share: Float[Array, ""]) -> Float[Array, " l"]:
     """Factors of the window 1 / (1 + lambda l^2 (l+1)^2), which reduces ringing with the least change of the function.
 
     The window minimizes the squared change plus lambda times the squared Laplacian, both integrated over the sphere.

@@ -29,7 +29,7 @@ def count(*, cells: int) -> int:
 
 
 @partial(jit, static_argnames="cells")
-def integrals(value: Float[Array, "6 n n *c"], *, cells: int) -> Float[Array, "h *c"]:
+def integrals(value: Float[Array, "6 n n *c"], *, cells: int) -> Float[Array, " h *c"]:
     """Integrals over the sphere of a function times each hat function.
 
     Args:
@@ -50,7 +50,7 @@ def integrals(value: Float[Array, "6 n n *c"], *, cells: int) -> Float[Array, "h
     return jnp.sum(padded[index], 1).reshape(-1, *channels)
 
 
-def project(value: Float[Array, "6 n n *c"], *, cells: int) -> Float[Array, "h *c"]:
+def project(value: Float[Array, "6 n n *c"], *, cells: int) -> Float[Array, " h *c"]:
     """Coefficients of the combination of hat functions that is closest to a function in the least-squares sense.
 
     Args:

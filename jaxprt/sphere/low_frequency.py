@@ -30,7 +30,7 @@ ORDERS = ("rising", "falling", "alternating")
 
 
 @jit
-def irradiance(coefficient: Float[Array, "lm *c"], normal: Float[Array, "*b 3"]) -> Float[Array, "..."]:
+def irradiance(coefficient: Float[Array, " lm *c"], normal: Float[Array, "*b 3"]) -> Float[Array, "..."]:
     """Irradiance without shadows for given normals: the light convolved with the clamped cosine.
 
     Irradiance times albedo / pi is the radiance of an ideal diffuse surface. Nine coefficients determine almost all of
@@ -53,7 +53,7 @@ def irradiance(coefficient: Float[Array, "lm *c"], normal: Float[Array, "*b 3"])
 
 
 @jit
-def dominant_direction(coefficient: Float[Array, "lm *c"]) -> Float[Array, "3"]:
+def dominant_direction(coefficient: Float[Array, " lm *c"]) -> Float[Array, "3"]:
     """Dominant direction of a light: the mean of directions weighted by radiance, normalized.
 
     It is the direction of the linear band (l = 1). With three colors, their luminance is used, otherwise their mean.
@@ -82,7 +82,7 @@ def dominant_direction(coefficient: Float[Array, "lm *c"]) -> Float[Array, "3"]:
 
 
 @jit
-def directional_light(coefficient: Float[Array, "lm *c"]) -> tuple[Float[Array, "3"], Float[Array, "*c"]]:
+def directional_light(coefficient: Float[Array, " lm *c"]) -> tuple[Float[Array, "3"], Float[Array, "*c"]]:
     """The directional light in the dominant direction that approximates a light best by least squares.
 
     A directional light E delta(s - d) has SH coefficients E y_i(d). The irradiance E minimizes their squared difference
@@ -108,7 +108,7 @@ def directional_light(coefficient: Float[Array, "lm *c"]) -> tuple[Float[Array, 
 
 @jit
 def directional_and_ambient(
-    coefficient: Float[Array, "lm *c"],
+    coefficient: Float[Array, " lm *c"],
 ) -> tuple[Float[Array, "3"], Float[Array, "*c"], Float[Array, "*c"]]:
     """The sum of a directional and a constant (ambient) light that approximates a light best by least squares.
 
@@ -149,7 +149,7 @@ def _check(coefficient: Array) -> None:
 
 
 @partial(jit, static_argnames="degree")
-def product(first: Float[Array, "i *c"], second: Float[Array, "j *#c"], *, degree: int) -> Float[Array, "k *c"]:
+def product(first: Float[Array, " i *c"], second: Float[Array, "j *#c"], *, degree: int) -> Float[Array, " k *c"]:
     """SH coefficients of the product of two functions, up to a degree.
 
     For example, light times visibility, or an albedo map times irradiance. Linear in each argument.
@@ -178,7 +178,7 @@ def product(first: Float[Array, "i *c"], second: Float[Array, "j *#c"], *, degre
 
 
 @partial(jit, static_argnames="degree")
-def operator(coefficient: Float[Array, "i *c"], *, degree: int) -> Float[Array, "k j *c"]:
+def operator(coefficient: Float[Array, " i *c"], *, degree: int) -> Float[Array, "k j *c"]:
     """Matrix that multiplies functions of a degree by a given function and projects the product to that degree.
 
     `operator(f, degree=n) @ g` equals `product(f, g, degree=n)` for g of degree n. Use it to multiply many functions by
@@ -202,7 +202,7 @@ def operator(coefficient: Float[Array, "i *c"], *, degree: int) -> Float[Array, 
 
 @jit
 def triple(
-    first: Float[Array, "i *c"], second: Float[Array, "j *#c"], third: Float[Array, "k *#c"]
+    first: Float[Array, " i *c"], second: Float[Array, "j *#c"], third: Float[Array, "k *#c"]
 ) -> Float[Array, "*c"]:
     """Integral of the product of three functions over the sphere, such as light x visibility x BRDF.
 

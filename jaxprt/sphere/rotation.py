@@ -37,7 +37,7 @@ _UNROLLED = 6
 
 
 @jit
-def rotate(coefficient: Float[Array, "lm *c"], rotation: Float[Array, "3 3"]) -> Float[Array, "lm *c"]:
+def rotate(coefficient: Float[Array, " lm *c"], rotation: Float[Array, "3 3"]) -> Float[Array, " lm *c"]:
     """Rotates a spherical function given by its SH coefficients.
 
     The result represents s -> f(R^T s), so rotate(evaluate(s), R) == evaluate(R s). Differentiable in both arguments at
@@ -81,8 +81,8 @@ def rotate_each(coefficient: Float[Array, "lm c *v"], rotation: Float[Array, "w 
 
 @jit
 def about_z(
-    coefficient: Float[Array, "lm *c"], cosine: Float[Array, "*v"], sine: Float[Array, "*v"]
-) -> Float[Array, "lm *d"]:
+    coefficient: Float[Array, " lm *c"], cosine: Float[Array, "*v"], sine: Float[Array, "*v"]
+) -> Float[Array, " lm *d"]:
     """Rotates about z by angles given by their cosine and sine. This mixes orders m and -m of each band.
 
     The result is a polynomial in cosine and sine, and differentiated as such. If (cosine, sine) is not of unit length,

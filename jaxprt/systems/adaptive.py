@@ -208,7 +208,7 @@ def _visit(fixed: tuple, colors: int) -> Callable:
     return visit
 
 
-def brightest(light: Float[Array, "l *d"], weight: Float[Array, "l *#d"]) -> Float[Array, "*d"]:
+def brightest(light: Float[Array, " l *d"], weight: Float[Array, "l *#d"]) -> Float[Array, "*d"]:
     """Maximum over lights of light times weight.
 
     Lights are processed one at a time, because the compiler's loop for a maximum over all lights is much slower.

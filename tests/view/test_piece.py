@@ -221,7 +221,7 @@ def test_larger_errors_and_sizes_than_accepted_are_refused_with_their_causes(sys
 def test_size_that_is_asked_for_is_kept_and_bounces_that_are_none_cause_no_error(systems, lights, tmp_path):
     scene = systems["lobes"].without_bounces()
     lobes = [put(scene.part_system(number)).system for number in range(2)]  # without single texels
-    bare = RelitScene(scene.scene, scene.shading, Place.apart(scene.place.counts), lobes)
+    bare = RelitScene(scene.scene, scene.shading, Layout.apart(scene.layout.counts), lobes)
     whole = view.export(bare, tmp_path / "a.html", environments={"lamp": lights["lamp"]})
     assert {cause.name for cause in whole.causes} == {"shadows", "visibility"}
     most = whole.nbytes - 2000

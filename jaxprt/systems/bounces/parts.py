@@ -156,7 +156,7 @@ class Members(eqx.Module):
     area: Float[Array, " v"]
     regions: int = eqx.field(static=True)
 
-    def mean(self, value: Float[Array, "v *k"]) -> Float[Array, "r *k"]:
+    def mean(self, value: Float[Array, " v *k"]) -> Float[Array, " r *k"]:
         """Means of a value of the vertices over the area of each region; zero for a region without area."""
         wide = self.area.reshape(-1, *[1] * (value.ndim - 1))
         total, whole = (jax.ops.segment_sum(column, self.region, self.regions) for column in (wide * value, self.area))

@@ -207,7 +207,7 @@ def _flat(lobe: LobeBrdf, members: int) -> LobeBrdf:
     return LobeBrdf(*rows, (number,), lobe.error)
 
 
-def _no_lobes(diffuse: Float[Array, "c *q"], knots: Sequence[np.ndarray]) -> LobeBrdf:
+def _no_lobes(diffuse: Float[Array, " c *q"], knots: Sequence[np.ndarray]) -> LobeBrdf:
     """A table of a diffuse part and of one lobe without weight, because arrays without lobes have no shape."""
     shape, dtype = diffuse.shape[1:], diffuse.dtype
     mean = jnp.zeros((3, 1, *shape), dtype).at[2].set(1)
@@ -229,7 +229,7 @@ def _at_nodes(
     nodes: tuple[int, ...] | None,
     size: Sequence[int],
     isotropic: bool,
-) -> Float[Array, "c *q"]:
+) -> Float[Array, " c *q"]:
     """Albedos at the texels of parabolic maps, as those at the nodes of a table of lobes."""
     albedo, way = np.asarray(base), np.asarray(direction)
     edge = math.isqrt(len(way))

@@ -88,9 +88,9 @@ class LobeBrdf(eqx.Module):
     holds_cosine: ClassVar = True  # values include the cosine of the light direction
 
     mean: Float[Array, "3 l *q"]
-    scale: Float[Array, "l *q"]
+    scale: Float[Array, " l *q"]
     weight: Float[Array, "c l *q"]
-    diffuse: Float[Array, "c *q"]
+    diffuse: Float[Array, " c *q"]
     knot: tuple[Float[Array, " _"], ...]
     error: Float[Array, ""]
 
@@ -430,7 +430,7 @@ class _Entry(NamedTuple):
     diffuse: Float[Array, "v c"]
 
 
-def _entries_between(row: Float[Array, "r *q"], knot: list, axis: list, *, lobes: int) -> _Entry:
+def _entries_between(row: Float[Array, " r *q"], knot: list, axis: list, *, lobes: int) -> _Entry:
     """Interpolates rows of a table for views with their own parameters: between knots first, then between nodes."""
     sizes = row.shape[1:]
     place, share = [], []
