@@ -205,13 +205,14 @@ def compared(
 ) -> dict[str, Any]:
     """What our pictures are off."""
     rows, columns = [], {name: {} for name in ("errors", "flips", "biases", "noises", "whole")}
-    backs, undefined = theirs["sides"]
+    (backs, undefined), judged = theirs["sides"], 0.0
     for light, drawn, halves in zip(lights, ours["pictures"], theirs["halves"], strict=True):
         try:
             kept = np.where(undefined[..., None], 0, halves)  # without coverage, they are not compared
             truth = denoised.Truth(kept, theirs["samples"])
         except ValueError as error:
             return {"unreadable": str(error)}
+        judged = float(truth.inside.sum() / (halves[..., 3] > 0).all(0).sum())
         row, flip = sheet(drawn, halves.mean(0), truth.inside)
         whole = denoised.Truth(kept, theirs["samples"], covered=0.0).error(drawn)
         figures = truth.error(drawn), flip, truth.bias(drawn), truth.noise, whole
@@ -224,8 +225,7 @@ def compared(
     mismatch = np.abs(ours["covered"] - theirs["halves"][0].mean(0)[..., 3]) > 0.5
     shares = {"mismatch": mismatch, "backs": backs, "undefined": undefined}
     extra = {name: float(value.mean()) for name, value in shares.items()} | {"unjudged": theirs["unjudged"]}
-    extra["judged"] = float(truth.inside.sum() / (theirs["halves"][-1][..., 3] > 0).all(0).sum())
-    return {"error": max(columns["errors"].values()), **columns, **extra}
+    return {"error": max(columns["errors"].values()), **columns, **extra, "judged": judged}
 
 
 def summary(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
