@@ -489,9 +489,6 @@ EXAMPLES = {
     "brdf.cylinders.PoulinFournier": model(
         lambda draw: brdf.PoulinFournier(draw.uniform(3), draw.uniform(1), 20.0, 2.5, 0.3)
     ),
-    "brdf.cylinders.PoulinFournierGrooves": model(
-        lambda draw: brdf.PoulinFournierGrooves(draw.uniform(3), draw.uniform(1), 20.0, 2.5, 0.3)
-    ),
     "systems.separable.factorization.SeparableBrdf": model(lambda draw: draw.separable()),
     # Cosines are clipped to [-1, 1], which a direction's own reaches: a table, of no use to derivatives.
     "systems.separable.factorization.light_covariance": example(lambda draw: call(draw.unit(4)), gradient=(), degree=6),

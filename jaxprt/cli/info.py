@@ -9,11 +9,11 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import click
 import jax
 import numpy as np
-from numpy.typing import ArrayLike
 
 import jaxprt
 from jaxprt import brdf, compile
@@ -242,7 +242,7 @@ def _scene_rows(facts: JsonObject) -> Iterator[str]:
         yield f"camera {number}: at {_value(camera['eye'])}, {angle} degrees high"
 
 
-def _matters(name: str, value: ArrayLike) -> bool:
+def _matters(name: str, value: Any) -> bool:
     """Whether a parameter of a material differs from its default in glTF."""
     default = inputs.describe(TexturedMaterial())
     return name not in default or not np.array_equal(value, default[name])

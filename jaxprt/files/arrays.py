@@ -27,7 +27,6 @@ from typing import Any, BinaryIO, NamedTuple
 
 import filelock
 import numpy as np
-from numpy.typing import ArrayLike
 
 from jaxprt.files import inputs, outputs
 
@@ -296,7 +295,7 @@ class BlockStore:
         return value
 
 
-def sketch(array: ArrayLike, *, tolerance: float = 1e-3) -> list[float]:
+def sketch(array: Any, *, tolerance: float = 1e-3) -> list[float]:
     """A short fingerprint of an array that tolerates rounding: its norm, and sums of its values with random signs.
 
     The distance between the sums of two arrays approximates the distance between the arrays.

@@ -205,8 +205,8 @@ class Layout(eqx.Module):
         slopes: list[Any] = [of_part.slope for of_part in members]
         slope = None if any(rows is None for rows in slopes) else xp.concatenate(slopes, 2)
         corners = (xp.concatenate(rows, 1) for rows in (in_scene, corner))
-        whole, own = (Points(jnp.asarray(rows), jnp.asarray(weight), slope) for rows in corners)
-        return whole, own
+        scene, of_group = (Points(jnp.asarray(rows), jnp.asarray(weight), slope) for rows in corners)
+        return scene, of_group
 
     def column(self, group: int, rows: Sequence[Any]) -> Any:
         """One array of a group from those of its parts. Padding repeats the last row."""

@@ -132,7 +132,7 @@ def make(
         if shading.matte:
             groups.append(LitByLamps(transport, albedo=shading.albedo))
         else:
-            groups.append(LitByLamps(transport, lobe_table(shading, _LOBES, system)))
+            groups.append(LitByLamps(transport, lobe_table(shading, _LOBES, system=system)))
     area = tuple(np.asarray(areas(shadings[part].mesh), jnp.result_type(float)) for part in emitting)
     return SceneLamps(tuple(groups), tuple(emitting), area, point_lights)
 

@@ -440,7 +440,7 @@ def samples_of(shading: Shading, size: int) -> int:
     return bright_texels.samples_for(sharpest, size=size)
 
 
-def lobe_table(shading: Shading, lobes: int, system: System | None = None) -> lobe.LobeBrdf:
+def lobe_table(shading: Shading, lobes: int, *, system: System | None = None) -> lobe.LobeBrdf:
     """The BRDF of a part as a table of lobes, over roughness if that varies: that of its system where it has one."""
     rest = system.system if isinstance(system, bright_texels.BrightTexels) else system
     if isinstance(rest, lobe.LobeSystem):

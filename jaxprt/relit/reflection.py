@@ -135,7 +135,7 @@ def _lobes(shadings: Sequence[Shading], system: System) -> LobeBrdf | None:
     """The BRDF of a group as lobes if some of its parts are sharp, or may become so; None for other groups."""
     if shadings[0].matte:
         return None
-    table = lobe_table(shadings[0], _LOBES, system)
+    table = lobe_table(shadings[0], _LOBES, system=system)
     return table if shadings[0].table is not None or any(is_sharp(part, table) for part in shadings) else None
 
 

@@ -13,11 +13,10 @@ import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import tqdm
-from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from jaxprt import require
@@ -288,7 +287,7 @@ class _Memory:
             into[...] = array[name][(*before, slice(into.shape[at.axis]))]
 
 
-def fingerprint(*array: ArrayLike) -> str:
+def fingerprint(*array: Any) -> str:
     """SHA-256 of the shapes, types and bytes of some arrays."""
     digest = hashlib.sha256()
     for value in array:
