@@ -3,6 +3,8 @@
 Headless Chromium, found as `chromium`; skipped where there is none, unless JAXPRT_BROWSER_REQUIRED is set.
 """
 
+import base64
+import pathlib
 import threading
 import time
 
@@ -11,7 +13,7 @@ import pytest
 
 import jaxprt as prt
 from benchmarks.endurance import growth, held
-from jaxprt import files, image
+from jaxprt import files, image, view
 from jaxprt.image import tonemap
 from jaxprt.scene import Camera
 from jaxprt.scene.environment import rotate
@@ -25,7 +27,7 @@ def drawn(hand, systems, lights, shadows="rays"):
     state, camera = hand.state(), hand.camera()
     scene = systems[state["system"]]
     if not state["bounces"]:
-        scene = prt.RelitScene(scene.scene, scene.without_bounces(), scene.shading)
+        scene = scene.without_bounces()
     c, s = np.cos(state["turn"]), np.sin(state["turn"])
     light = rotate(list(lights.values())[state["light"]], np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]))
     height, width = hand.pixels().shape[:2]
@@ -417,3 +419,16 @@ def test_the_page_displays_colors_by_the_tone_curves_of_python(hand):
         # Bytes of the first picture, and their slope.
         assert np.median(np.abs(found - expected)) < 0.006
         assert np.percentile(np.abs(found - expected), 99) < 0.03
+
+
+def test_what_is_drawn_has_the_shape_of_the_window(browser):
+    code = base64.b64encode((pathlib.Path(view.__file__).parent / "browser" / "common.js").read_bytes()).decode()
+    page = browser.new_page()
+    for width, height, ratio in ((3840, 2000, 1), (2560, 1440, 1), (1176, 800, 2), (1464, 1000, 3), (320, 320, 1)):
+        size = page.evaluate(
+            f"""async () => (await import("data:text/javascript;base64,{code}"))
+            .drawnSize({{ width: {width}, height: {height} }}, {ratio})"""
+        )
+        assert size["width"] / size["height"] == pytest.approx(width / height, rel=1e-3)
+        assert 0.5 * min(2, ratio) * width < size["width"] <= min(2 * width, 2048)
+    page.close()
