@@ -101,7 +101,7 @@ def test_tangents_follow_nodes_and_webp_replaces_other_images(small):
     edited(small, change)
     by_color = {surface.color is None: surface for surface in asset_files.read(small)}
     np.testing.assert_allclose(by_color[True].material.base_map.image, np.tile([1, 0, 0], (2, 2, 1)))
-    # Its node has a scale of -1 along z, which mirrors the tangent and turns the side of the bitangent.
+    # The node scales z by -1. That mirrors the tangent and swaps the side of the bitangent.
     np.testing.assert_allclose(by_color[False].tangent, np.tile([0, 0, -1, -1], (4, 1)))
 
 

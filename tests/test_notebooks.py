@@ -89,7 +89,7 @@ def test_a_cell_that_fails_is_named(tmp_path):
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
 def test_a_notebook_is_small_and_readable_without_a_kernel_as_it_is_committed(path):
-    """Of one run from the top, with pictures, without errors, warnings, widgets or folders of some machine."""
+    """A notebook ran once from the top. It shows pictures, and no errors, warnings, widgets or folders of a machine."""
     assert path.stat().st_size <= LARGEST
     notebook, code = json.loads(path.read_text()), _code(path)
     assert notebook["metadata"]["kernelspec"]["name"] == "python3"

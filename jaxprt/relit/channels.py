@@ -57,7 +57,7 @@ class Shading(eqx.Module):
         blend: Weights of the channels at each vertex, and the logarithm of roughness there if it varies. None for a
             part with a BRDF that cannot change.
         emitted: Radiance that the surface emits; None if it does not emit.
-        term: Indices of the channels among the coefficients of a `Look`.
+        term: Indices of the channels among the coefficients of a `MaterialLook`.
         scale: Factor of each channel. The weights of `blend` are divided by it.
         table: The standard tables of the BRDF; None for a BRDF with tables of its own.
     """

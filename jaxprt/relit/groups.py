@@ -46,7 +46,7 @@ class Surface(eqx.Module):
         reflecting: How they reflect light from other surfaces; None without bounces.
         lit: How they reflect light from lamps; None without lamps.
         scale: Factor of each channel of the BRDF; None for a BRDF that cannot change.
-        term: Indices of the channels among the coefficients of a `Look`.
+        term: Indices of the channels among the coefficients of a `MaterialLook`.
         varies: Whether the system takes the roughness of each point.
     """
 

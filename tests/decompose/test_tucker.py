@@ -102,7 +102,7 @@ def test_the_error_is_within_the_bounds_of_the_theorems(decompose, x64):
 
 @pytest.mark.parametrize(("shape", "mode"), [((3, 4, 5, 6), 0), ((3, 4, 5, 6), 2), ((3, 2 * 4096 + 5), 0)])
 def test_gram_matrices_and_products_are_those_of_the_unfolding(shape, mode, close):
-    """Of wide matrices too, which are summed over blocks of columns."""
+    """Wide matrices are summed over blocks of columns."""
     tensor = np.random.default_rng(0).standard_normal(shape).astype(np.float32)
     unfolded = np.moveaxis(tensor.astype(float), mode, 0).reshape(shape[mode], -1)
     close(tucker.gram(tensor, mode=mode), unfolded @ unfolded.T)

@@ -351,7 +351,7 @@ def test_layers_are_left_out_with_a_warning(name):
         shading = channels.of_part(spheres(material).parts[0])
     alone = channels.of_part(spheres(shown).parts[0])
     assert shading.table is alone.table
-    np.testing.assert_allclose(shading.blend.weight, alone.blend.weight, rtol=1e-4)
+    np.testing.assert_allclose(shading.blend.weight, alone.blend.weight, rtol=1e-5)
 
 
 def test_pictures_are_without_a_coat_that_is_left_out():

@@ -19,11 +19,11 @@ def ball_on_ground() -> Mesh:
 
 @functools.cache
 def seen_on_ground() -> StoredVisibility:
-    """Its visibility."""
+    """The visibility of the ball on the ground."""
     return visibility.precompute(ball_on_ground(), size=SIZE)
 
 
 @functools.cache
 def pyramids_on_ground() -> lobe.LobeTransport:
-    """Its visibility pyramids."""
+    """The visibility pyramids of the ball on the ground."""
     return lobe.compress(seen_on_ground())
