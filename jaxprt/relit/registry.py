@@ -57,7 +57,7 @@ def register(name: str, extension: Recipe | type) -> None:
     then imported by commands, by `jaxprt.files.load` and by `jaxprt.precompute` where they need it:
 
         [project.entry-points.jaxprt]
-        occlusion = "occlusion.registered"
+        texels = "texels"
 
     Args:
         name: Lower-case letters, digits, - and _, with a letter first. Registering a class again replaces it.

@@ -29,7 +29,7 @@ from jaxprt.systems.standard import tables
 from jaxprt.systems.standard.tables import METALLIC_ROUGHNESS, SHEEN, StandardTable
 
 BASE = 4  # number of terms of the base
-# Coefficients of a `MaterialLook`: terms of the base, terms under a coat and the coat, those under a sheen and the sheen.
+# Coefficients of a `MaterialLook`: terms of the base, terms under a coat and the coat, those under a sheen and it.
 _UNDER_COAT, _UNDER_SHEEN = BASE, 2 * BASE + 1
 _MIRROR = 1  # index of the term of metallic-roughness whose lobe is that of a coat
 _WHITE = 3  # index of the ideally diffuse term
