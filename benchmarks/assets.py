@@ -16,7 +16,7 @@ specification.
 Each file is one line. `error` is relative L2 over the pixels that surfaces fill, without Mitsuba's noise, the largest
 of the lights; `errors`, `flips`, `biases` and `noises` have all of them. `judged` is the share of these pixels among
 all that surfaces touch; `whole` is the error of all, with outlines and alpha over a black background. Mitsuba takes
-samples until its noise is below a third of the error, or `BLOCKS` times as many as asked for: glints of a sun on
+samples until its noise is below a third of `whole`, or `BLOCKS` times as many as asked for: glints of a sun on
 smooth metal may stay uncertain. `mismatch` is the share of pixels in which the shares that surfaces cover differ by
 more than a half. `backs` is the share of pixels that show the back of a surface of one side: black here, while glTF's
 viewers see through it. `undefined` is the share of pixels that are left out, because interpolated normals look away
