@@ -142,7 +142,7 @@ class Lobes(Recipe):
             many, because a texel costs it only about 1/30 as much; every bright light source then has a sharp shadow.
     """
 
-    lobes: int = 12
+    lobes: int = 8
     texels: int = 16
 
     def coarse(self) -> Recipe:
@@ -160,7 +160,8 @@ class Lobes(Recipe):
             matte = lobe.MatteSystem(lobe.matte_transport(transport), shading.albedo)
             return _bright(matte, lobe.texel_bits(transport), shading, _MATTE_TEXELS * self.texels, transport.size)
         table = lobe_table(shading, self.lobes)
-        return _bright(lobe.LobeSystem(transport, table), transport, shading, self.texels, transport.size)
+        system = lobe.LobeSystem(transport, table)
+        return _bright(system, transport, shading, self.texels, transport.size, cells=True)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
         """Smallest number of bytes: transfer vectors, and visibility as pyramids, or as bits for a Lambertian part."""
@@ -375,7 +376,8 @@ class Dynamic(Recipe):
         name = "" if self.ranks is None else "_" + "_".join(map(str, (self.lobes, *self.ranks)))
         options = {**sizes, "run": target.run.within(f"dynamic{name}.prt")}
         transport = axes.pad(dynamic.compress(known.visible, brdf, pyramid=known.pyramid, **options), vertices)
-        return _bright(dynamic.DynamicSystem(transport, brdf), transport.pyramid, shading, self.texels, target.size)
+        system = dynamic.DynamicSystem(transport, brdf)
+        return _bright(system, transport.pyramid, shading, self.texels, target.size, cells=True)
 
     def least_bytes(self, shading: Shading, *, vertices: int, size: int) -> int:
         """Number of bytes of the visibility, the weights of the components, the cores and the modes."""
@@ -421,13 +423,14 @@ def _pyramid(mesh: Mesh, target: Target) -> LobeTransport:
     return lobe.precompute(mesh, size=target.size, apart=True, **target.traced("lobe"))
 
 
-def _bright(system: System, visible, shading: Shading, texels: int, size: int) -> System:
-    """The system with an exact sum over the brightest texels, if there are any."""
+def _bright(system: System, visible: Any, shading: Shading, texels: int, size: int, *, cells: bool = False) -> System:
+    """The system with an exact sum over the brightest texels, if there are any, and over cells of the light."""
     texels = min(texels, 6 * size * size - 1)
     if not texels:
         return system
     samples = samples_of(shading, size)
-    return bright_texels.BrightTexels(system, visible, shading.brdf, count=texels, samples=samples)
+    levels = bright_texels.levels_for(samples, size) if cells else ()
+    return bright_texels.BrightTexels(system, visible, shading.brdf, count=texels, samples=samples, levels=levels)
 
 
 def samples_of(shading: Shading, size: int) -> int:

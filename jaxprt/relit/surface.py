@@ -151,9 +151,9 @@ def _from_texels(
 ) -> Float[Array, "p c"]:
     """Radiance that points reflect from single texels of the light."""
     light = texel, excess / picture_rays.FULL, share
-    options = {"size": size, "samples": samples, "spot": spot}
+    squares = (bright_texels.Squares(size, len(texel), samples),)
     return bright_texels.texel_radiance(
-        surface.brdf, sight.frame, sight.wo, light, VERTICES, sight.blend, above=sight.above, **options
+        surface.brdf, sight.frame, sight.wo, light, VERTICES, sight.blend, squares=squares, above=sight.above, spot=spot
     )
 
 

@@ -2,9 +2,9 @@
 
 import dataclasses
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -20,9 +20,14 @@ from jaxprt.scene.points import VERTICES, Points, placed
 from jaxprt.sphere import cubemap, directions
 from jaxprt.systems import adaptive, protocol
 from jaxprt.systems.protocol import Blend, System, VertexSystem
-from jaxprt.visibility import LEVELS
 
 _ROW = 32  # texels per row, of which only the brightest is sorted at first
+CELLS = 32, 16, 8  # edges of faces in cells: squares of texels whose mean radiance is taken out
+# Edges and numbers of cells that are taken out together, from fine to coarse. The light chooses one of them.
+_PLANS = ((32, 64), (8, 32)), ((16, 64), (8, 64)), ((32, 64),), ((8, 64),)
+_JUMP, _WITHIN = 16, 0.1  # edge of the means whose steps lobes cannot follow, and what steps within them count
+_WIDE = 4  # edge of the means about which steps are counted
+FULL = 240  # the share of a texel or cell that is all visible: sixteenths and quarters are whole numbers
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
 _TOGETHER = 32  # texels whose visibility is read at once
 _value = jit(adaptive.value)
@@ -52,14 +57,23 @@ class Visibility(Protocol):
         ...
 
 
+@runtime_checkable
+class CellVisibility(Visibility, Protocol):
+    """Interface of transport that has the visibility of cells too."""
+
+    def cells(self, cell: Int[Array, " t"], *, edge: int) -> Float[Array, "t v"]:
+        """Visible share of each of the given cells of faces with an edge of so many cells, for every vertex."""
+        ...
+
+
 class BrightLight(eqx.Module):
     """A light whose brightest texels are kept separately.
 
     Attributes:
         rest: The rest of the light, in the form of the underlying system.
-        texel: Indices of the brightest texels.
-        excess: Radiance taken out of each of these texels.
-        seen: Visible share of each texel for every vertex, in sixteenths; None before `BrightTexels.shade`, and for
+        texel: Indices of the brightest texels, and then of cells from level to level.
+        excess: Radiance taken out of each of these texels and cells.
+        seen: Visible share of each of them for every vertex, in 240ths; None before `BrightTexels.shade`, and for
             ideally diffuse surfaces.
         flux: Vector irradiance / pi of every vertex by all of these texels, and then its irradiance / pi, for ideally
             diffuse surfaces; None before `BrightTexels.shade`, and for others.
@@ -99,6 +113,7 @@ class BrightTexels(VertexSystem):
         count: Number of texels that are summed exactly.
         samples: Number of sample points along the edge of each texel, from `samples_for`; None for its center, whatever
             the material.
+        levels: Edges of faces in cells of which some are summed too, from fine to coarse; () for texels alone.
     """
 
     system: System
@@ -106,19 +121,32 @@ class BrightTexels(VertexSystem):
     brdf: Callable
     count: int = eqx.field(static=True, default=16)
     samples: int | None = eqx.field(static=True, default=1)
+    levels: tuple[int, ...] = eqx.field(static=True, default=())
 
     def __check_init__(self):
         """Refuses arguments that are not a system or visibility, and visibility of other vertices."""
         source = "jaxprt.visibility.precompute or jaxprt.lobe.precompute"
         require.kind("the system", self.system, System, source="jaxprt.lobe.LobeSystem or another system")
-        require.kind("the visibility", self.visibility, Visibility, source=source)
+        require.kind("the visibility", self.visibility, CellVisibility if self.levels else Visibility, source=source)
         require.length("vertices of the visibility", self.visibility.position, self.system.vertices)
 
     def light(self, environment: Environment) -> BrightLight:
         """Splits the light into its brightest texels and the rest, which the underlying system converts."""
         environment = protocol.light_for(self, environment)
         texel, excess, rest = split(environment, count=self.count)
+        if self.levels:
+            cell, taken, rest = split_cells(rest, levels=self.levels)
+            texel, excess = jnp.concatenate([texel, cell]), jnp.concatenate([excess, taken])
         return BrightLight(self.system.light(rest), texel, excess)
+
+    @property
+    def squares(self) -> tuple["Squares", ...]:
+        """The texels and the cells of each level, in the order of `BrightLight`."""
+        size, samples = self.visibility.size, self.samples or 1
+        texels = Squares(size, self.count, samples)
+        steps = [int(np.log2(size // edge)) for edge in self.levels]
+        cells = zip(self.levels, cell_counts(self.levels), steps, strict=True)
+        return texels, *(Squares(edge, count, samples + step // 3) for edge, count, step in cells)
 
     def shade(self, light: BrightLight, materials: PyTree = None) -> BrightLight:
         """Light of the rest that arrives at the vertices, and what they see of the bright texels."""
@@ -130,7 +158,7 @@ class BrightTexels(VertexSystem):
             return light
         if self.matte and getattr(self.brdf, "matte", False):
             return dataclasses.replace(light, flux=_vector_flux(self.visibility, light.texel, light.excess))
-        return dataclasses.replace(light, seen=_sixteenths(self.visibility, light.texel))
+        return dataclasses.replace(light, seen=_shares(self.visibility, light.texel, light.excess, self.squares))
 
     def tilted(self, light: BrightLight, normal: Float[Array, "v 3"]) -> BrightLight:
         """The light, whose rest is that of the underlying system: `System.tilted`."""
@@ -150,10 +178,9 @@ class BrightTexels(VertexSystem):
         light, rest = self._seen(light), self.system.combine(light.rest, view.rest, points)
         if light.flux is not None:
             return rest + self._diffuse(light.flux, view, points).T * self.system.diffuse_albedo(view.rest)
-        texels = light.texel, light.excess / LEVELS, light.seen
-        options = {"size": self.visibility.size, "samples": self.samples or 1}
+        texels = light.texel, light.excess / FULL, light.seen
         brdf = grid.as_argument(self.brdf)
-        return rest + texel_radiance(brdf, view.frame, view.wo, texels, points, view.blend, **options)
+        return rest + texel_radiance(brdf, view.frame, view.wo, texels, points, view.blend, squares=self.squares)
 
     def _diffuse(self, flux: Float[Array, "c 4 v"], view: BrightView, points: Points) -> Float[Array, "c _"]:
         """Irradiance / pi by the bright texels: max(F . n + max(E - F . m, 0), 0)."""
@@ -214,9 +241,113 @@ class BrightTexels(VertexSystem):
 
     @property
     def shared_light(self) -> tuple | None:
-        """Key of the light: that of the underlying system, with the number of texels."""
+        """Key of the light: that of the underlying system, with the number of texels and the levels of cells."""
         rest = self.system.shared_light
-        return rest and (BrightTexels, self.count, rest)
+        return rest and (BrightTexels, self.count, self.levels, rest)
+
+
+class Squares(NamedTuple):
+    """Squares of faces of one size.
+
+    Attributes:
+        edge: Number along the edge of a face.
+        count: Number of squares.
+        samples: Number of sample points along the edge of each.
+    """
+
+    edge: int
+    count: int
+    samples: int
+
+
+def _plans(levels: Sequence[int]) -> list[tuple[tuple[int, int], ...]]:
+    """The plans whose cells are all of some levels."""
+    plans = [plan for plan in _PLANS if all(edge in levels for edge, _ in plan)]
+    longest = max((len(plan) for plan in plans), default=0)
+    return [plan for plan in plans if len(plan) == longest]
+
+
+def levels_for(samples: int, size: int) -> tuple[int, ...]:
+    """Levels of cells for a BRDF, by its sample points along the edge of a texel: none wider than its lobe."""
+    fine = [edge for edge in CELLS if edge < size]
+    return tuple(fine if samples <= 2 else fine[:1])
+
+
+def cell_counts(levels: Sequence[int]) -> list[int]:
+    """Number of cells of each level that some plan takes out."""
+    plans = _plans(levels)
+    return [max(dict(plan).get(edge, 0) for plan in plans) for edge in levels]
+
+
+@partial(jit, static_argnames=("levels",))
+def split_cells(
+    light: Environment, *, levels: tuple[int, ...]
+) -> tuple[Int[Array, " t"], Float[Array, "t c"], Environment]:
+    """Takes radiance out of cells of a light: squares of texels in which a lobe that is half hidden cannot be read.
+
+    The light chooses how many cells of each level are taken out: those that leave the least steps between means over
+    cells of 6 x 16 x 16.
+
+    Args:
+        light: One environment.
+        levels: Edges of faces in cells, from fine to coarse, each of which divides that of the faces in texels.
+
+    Returns:
+        Indices of cells, level after level, with zeros for those that are not used; the radiance taken out of each; and
+        the rest of the environment.
+    """
+    (size, colors), counts = light.radiance.shape[-2:], cell_counts(levels)
+    area, results, steps = cubemap.solid_angle(size=size)[..., None], [], []
+    for plan in _plans(levels):
+        rest, cells, taken = light.radiance, [], []
+        for edge, most in zip(levels, counts, strict=True):
+            count = dict(plan).get(edge, 0)
+            cell, excess = _largest_cells(rest, area, edge, count)
+            full = jnp.zeros((6 * edge**2, colors), rest.dtype).at[cell].set(excess)
+            rest = rest - _repeated(full.reshape(6, edge, edge, colors), size)
+            cells.append(jnp.pad(cell, (0, most - count)))
+            taken.append(jnp.pad(excess, ((0, most - count), (0, 0))))
+        results.append((jnp.concatenate(cells), jnp.concatenate(taken), rest))
+        steps.append(_steps(jnp.sum(rest, -1, keepdims=True), area))
+    best = jnp.argmin(jax.lax.stop_gradient(jnp.stack(steps)))
+    cell, excess, rest = (jnp.stack(rows)[best] for rows in zip(*results, strict=True))
+    return cell, excess, Environment(rest)
+
+
+def _largest_cells(light: Array, area: Array, edge: int, count: int) -> tuple[Int[Array, " t"], Float[Array, "t c"]]:
+    """The cells with the most flux, and the radiance by which each exceeds the next one."""
+    mean = _means(light, area, edge).reshape(6 * edge**2, -1)
+    flux = jax.lax.stop_gradient(jnp.sum(mean, -1)) * jnp.sum(_squares(area, edge), (2, 4)).ravel()
+    cell = jax.lax.top_k(flux, count + 1)[1]
+    bright = flux[cell]
+    fraction = jnp.maximum(1 - jnp.maximum(bright[-1], 0) / jnp.where(bright[:-1] > 0, bright[:-1], 1), 0)
+    fraction = jnp.where(bright[:-1] > 0, fraction, 0).astype(light.dtype)
+    return cell[:-1], mean[cell[:-1]] * fraction[:, None]
+
+
+def _squares(value: Float[Array, "6 n n c"], edge: int) -> Array:
+    """Texels by cells: [6 e f e f c]."""
+    fold = value.shape[1] // edge
+    return value.reshape(6, edge, fold, edge, fold, -1)
+
+
+def _means(value: Array, area: Array, edge: int) -> Float[Array, "6 e e c"]:
+    """Means over cells."""
+    return jnp.sum(_squares(value * area, edge), (2, 4)) / jnp.sum(_squares(area, edge), (2, 4))
+
+
+def _repeated(value: Float[Array, "6 e e c"], size: int) -> Float[Array, "6 n n c"]:
+    """Cells as texels."""
+    fold = size // value.shape[1]
+    return jnp.repeat(jnp.repeat(value, fold, 1), fold, 2)
+
+
+def _steps(light: Float[Array, "6 n n 1"], area: Array) -> Array:
+    """How much a light varies between cells, as far as lobes cannot follow it, relative to its largest radiance."""
+    size, light = light.shape[1], light / jnp.maximum(jnp.max(jnp.abs(light)), jnp.finfo(light.dtype).tiny)
+    fine = _repeated(_means(light, area, min(_JUMP, size)), size)
+    wide = _repeated(_means(light, area, _WIDE), size)
+    return jnp.sqrt(jnp.sum(area * ((fine - wide) ** 2 + (_WITHIN * (light - fine)) ** 2)))
 
 
 @require.arguments(light=protocol.one_light, count=partial(require.count, "the number of texels", least=-1))
@@ -337,7 +468,8 @@ def radiance(
     eye = require.position("the eye", eye)
     wo = directions.view(transport.frame, transport.position, eye)
     light = texel, excess, transport.visible(texel)
-    return texel_radiance(brdf, transport.frame, wo, light, VERTICES, blend, size=transport.size, samples=samples)
+    squares = (Squares(transport.size, len(texel), samples),)
+    return texel_radiance(brdf, transport.frame, wo, light, VERTICES, blend, squares=squares)
 
 
 def _floating_excess(transport: Visibility, texel: Array, excess: Array) -> Array:
@@ -348,7 +480,7 @@ def _floating_excess(transport: Visibility, texel: Array, excess: Array) -> Arra
     return require.floating(excess)
 
 
-@partial(jit, static_argnames=("size", "samples"))
+@partial(jit, static_argnames=("squares",))
 def texel_radiance(
     brdf: Callable,
     frame: Float[Array, "p 3 3"],
@@ -357,8 +489,7 @@ def texel_radiance(
     points: Points,
     blend: Blend | None,
     *,
-    size: int,
-    samples: int,
+    squares: tuple[Squares, ...],
     above: Float[Array, "p 3"] | None = None,
     spot: Float[Array, "t 4"] | None = None,
 ) -> Float[Array, "p e"]:
@@ -368,12 +499,11 @@ def texel_radiance(
         brdf: BRDF (wi, wo) -> value [*b c] in 1/sr on local directions.
         frame: Shading frames; rows are tangent, bitangent, normal.
         wo: Unit directions to the viewer in these frames.
-        light: Indices of the texels, their radiance, and their visible share at the vertices. Only the product of the
-            last two matters, so shares may be in sixteenths if the radiance is divided by 16.
+        light: Indices of the texels or cells, their radiance, and their visible share at the vertices. Only the product
+            of the last two matters, so shares may be in 240ths if the radiance is divided by 240.
         points: Points to which the shares are interpolated; all vertices for shares of the points themselves.
         blend: Weights of the BRDF's channels, and parameters; None for the BRDF as it is.
-        size: Edge of the cubemap faces in texels.
-        samples: Number of sample points along the edge of each texel.
+        squares: Size and number of the texels or cells, in their order, and of their sample points.
         above: Normals below whose horizon no light arrives, in addition to those of the frames; None without.
         spot: Where in each texel its light comes from, from `jaxprt.scene.light_samples.spots_in_texels`; None for
             everywhere.
@@ -413,23 +543,41 @@ def texel_radiance(
         return value(wi, wo, *parameter) * cosine
 
     if not len(texel):  # Rows are read by number: one that brings nothing.
-        texel, spot = jnp.zeros(1, jnp.int32), None
+        texel, spot, squares = jnp.zeros(1, jnp.int32), None, (Squares(1, 1, 1),)
         excess, visible = (jnp.zeros((1, rows.shape[1]), rows.dtype) for rows in (excess, visible))
-    direction, area = (row.astype(excess.dtype) for row in _points(texel, size, samples, spot))
-    count = direction.shape[1]
-    carried = count > 1 and not points.all_vertices
+    carried = any(square.samples > 1 for square in squares) and not points.all_vertices
     if carried:
         visible = mapped(points.carry, visible)
     # Sample points are processed one by one, so that intermediate arrays stay in the processor's cache. A loop over the
     # points of a texel within one over texels takes three times as long on CPUs.
-    rows = direction.reshape(-1, 3), area.reshape(-1, 3), jnp.repeat(jnp.arange(len(texel)), count)
-    return total(lit, rows).T
+    parts, first = [], 0
+    for edge, count, samples in squares:
+        number = np.repeat(np.arange(first, first + count), samples**2)
+        at = slice(first, first + count)
+        parts.append((*_points(texel[at], edge, samples, None if spot is None else spot[at]), number))
+        first += count
+    direction, area, number = zip(*parts, strict=True)
+    rows = (jnp.concatenate([part.reshape(-1, 3) for part in way]).astype(excess.dtype) for way in (direction, area))
+    return total(lit, (*rows, jnp.asarray(np.concatenate(number)))).T
 
 
-@jit
-def _sixteenths(visibility: Visibility, texel: Int[Array, " t"]) -> UInt8[Array, "t v"]:
-    """Visible share of each of the given texels for every vertex, in sixteenths."""
-    return jnp.round(visibility.visible(texel) * LEVELS).astype(jnp.uint8)
+@partial(jit, static_argnames=("squares",))
+def _shares(
+    visibility: Any, texel: Int[Array, " t"], excess: Float[Array, "t c"], squares: tuple[Squares, ...]
+) -> UInt8[Array, "t v"]:
+    """Visible share of each of the given texels and cells for every vertex, in 240ths; 0 for those not used."""
+    rows, first = [], 0
+    for edge, count, _ in squares:
+        cell, used = texel[first : first + count], jnp.any(excess[first : first + count] != 0)
+
+        def seen(cell: Array, edge: int = edge, finest: bool = not first) -> Array:
+            share = visibility.visible(cell) if finest else visibility.cells(cell, edge=edge)
+            return jnp.round(share * FULL).astype(jnp.uint8)
+
+        none = jnp.zeros((count, len(visibility.position)), jnp.uint8)
+        rows.append(seen(cell) if not first else jax.lax.cond(used, seen, lambda _, none=none: none, cell))
+        first += count
+    return jnp.concatenate(rows)
 
 
 @require.arguments(size=partial(require.count, "size", least=1))

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt import bright_texels, harmonic, reference
+import jaxprt
+from jaxprt import bright_texels, harmonic, lobe, reference
 from jaxprt.brdf import AshikhminShirley, Lambert
 from jaxprt.scene import Environment, builtin
 from jaxprt.scene.mesh import join
@@ -269,3 +270,64 @@ def test_texels_and_excess_of_whole_numbers_count_as_such_and_those_of_another_l
             call(texel + most - 15, jnp.ones((16, 3)))
         with pytest.raises(ValueError, match="the excess must be finite"):
             call(texel, jnp.full((16, 3), jnp.nan))
+
+
+def soft(size=32):
+    """A room with two soft boxes over a dim gradient, and noise in every texel."""
+    s, t = np.meshgrid(np.arange(size), np.arange(size))
+    room = np.random.default_rng(3).uniform(0.05, 0.15, (6, size, size, 3)) * np.array([1.0, 0.9, 0.7])
+    room[2] += 4 * ((abs(s - 9) < 4) & (abs(t - 20) < 7))[..., None]
+    room[0] += 9 * ((abs(s - 22) < 2) & (abs(t - 12) < 3))[..., None]
+    return Environment(jnp.asarray(room, jnp.float32))
+
+
+@pytest.mark.parametrize("strength", [1e-20, 1.0, 1e28])
+def test_cells_and_rest_are_the_light_and_leave_it_even(strength):
+    levels, size = (16, 8), 32
+    light = Environment(strength * soft(size).radiance)
+    cell, excess, rest = bright_texels.split_cells(light, levels=levels)
+    left, first = np.asarray(light.radiance, np.float64), 0
+    area = np.asarray(cubemap.solid_angle(size=size), np.float64)[..., None]
+    for edge, count in zip(levels, bright_texels.cell_counts(levels), strict=True):
+        rows, fold = slice(first, first + count), size // edge
+        taken, cells = np.asarray(excess, np.float64)[rows], np.asarray(cell)[rows]
+
+        def mean(value, edge=edge, fold=fold):
+            value, weight = (
+                x.reshape(6, edge, fold, edge, fold, -1) for x in (value * area, area + 0 * value[..., :1])
+            )
+            return (value.sum((2, 4)) / weight.sum((2, 4))).reshape(6 * edge**2, -1)
+
+        solid = area.reshape(6, edge, fold, edge, fold).sum((2, 4)).ravel()
+        before = mean(left).sum(1) * solid
+        np.testing.assert_array_equal(np.sort(cells), np.sort(np.argsort(-before)[:count]))  # those with the most flux
+        whole = np.zeros((6 * edge**2, 3))
+        whole[cells] = taken
+        left = left - whole.reshape(6, edge, edge, 3).repeat(fold, 1).repeat(fold, 2)
+        after = mean(left).sum(1) * solid
+        np.testing.assert_allclose(after[cells], np.sort(before)[-count - 1], rtol=1e-3)
+        first += count
+    assert np.all(np.asarray(excess) >= 0)
+    np.testing.assert_allclose(np.asarray(rest.radiance, np.float64), left, atol=1e-5 * strength)
+
+
+def test_a_black_light_has_no_cells_and_stays_black():
+    _, excess, rest = bright_texels.split_cells(Environment(jnp.zeros((6, 32, 32, 3))), levels=(16, 8))
+    assert not np.any(np.asarray(excess))
+    assert not np.any(np.asarray(rest.radiance))
+
+
+def test_soft_boxes_half_hidden_from_glossy_surfaces_are_right_by_cells(mesh):
+    """Lobes read the light and what is seen of it apart: beside a box behind the horizon of a neighbor they are off."""
+    light, brdf = soft(), AshikhminShirley(diffuse=0.0, specular=0.8, nu=20.0, nv=20.0)
+    seen = precompute(mesh, size=32, run=Run(progress=False))
+    rest = lobe.LobeSystem(lobe.compress(seen), lobe.tabulate(brdf, lobes=4))
+    expected = np.asarray(exact(seen, brdf, light))
+    off = []
+    for levels in ((), (16, 8)):
+        system = bright_texels.BrightTexels(rest, rest.transport, brdf, count=8, samples=1, levels=levels)
+        off.append(
+            np.linalg.norm(np.asarray(jaxprt.radiance(system, light, eye=EYE)) - expected) / np.linalg.norm(expected)
+        )
+    assert off[1] < 0.4 * off[0]
+    assert off[1] < 0.03

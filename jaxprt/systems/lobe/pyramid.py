@@ -74,6 +74,17 @@ class LobeTransport(eqx.Module):
         value = self.pyramid.at[:, byte].get(mode="promise_in_bounds")
         return ((value >> bit.astype(jnp.uint8)) & 1).T.astype(self.position.dtype)
 
+    def cells(self, cell: Int[Array, " t"], *, edge: int) -> Float[Array, "t v"]:
+        """Visible share of each of the given cells of faces with an edge of so many cells, for every vertex."""
+        scale, (face, row, column) = scales(self.size), _split(cell, edge)
+        number = scale.edge.tolist().index(edge)
+        if number < scale.bits:  # four texels are half of a byte
+            byte, bit = _bit(face, 2 * row, 2 * column, self.size)
+            four = self.pyramid.at[:, byte].get(mode="promise_in_bounds") >> bit.astype(jnp.uint8) & 15
+            return jax.lax.population_count(four).T.astype(self.position.dtype) / 4
+        place = int(scale.start[number]) + (face * (edge + 2) + row + 1) * (edge + 2) + column + 1
+        return self.pyramid.at[:, place].get(mode="promise_in_bounds").T.astype(self.position.dtype) / _BYTE
+
     def lobe_visibility(
         self,
         face: Int[Array, "l v"],

@@ -15,10 +15,9 @@ from jaxtyping import Array, Float, PyTree
 from jaxprt.compile import jit, total
 from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap, directions
-from jaxprt.systems.bright_texels import BrightLight, BrightTexels
+from jaxprt.systems.bright_texels import FULL, BrightLight, BrightTexels
 from jaxprt.systems.lobe.table import LobeMixture
 from jaxprt.systems.protocol import Blend, System
-from jaxprt.visibility import LEVELS
 
 
 class WidenedView(eqx.Module):
@@ -75,19 +74,23 @@ def combine(system: Any, light: PyTree, seen: WidenedView, points: Points) -> Fl
     """
     if not isinstance(light, BrightLight):
         return system.combine(light, seen.rest, points)
-    size = system.visibility.size
-    direction, area = (
-        quantity(size=size).reshape(-1, 3)[light.texel] for quantity in (cubemap.direction, cubemap.vector_area)
-    )
+    sent, first = system.system.combine(light.rest, seen.rest, points), 0
     frame = jnp.moveaxis(seen.frame, 0, 2)
-    # A texel is a lobe itself, as wide as it is.
-    lobe = seen.lobe.widened(jnp.full(seen.frame.shape[0], 4 * jnp.pi / (6 * size**2 * 12), frame.dtype))
+    for edge, count, _ in system.squares:
+        rows = slice(first, first + count)
+        direction, area = (
+            quantity(size=edge).reshape(-1, 3)[light.texel[rows]].astype(frame.dtype)
+            for quantity in (cubemap.direction, cubemap.vector_area)
+        )
+        # A texel or cell is a lobe itself, as wide as it is.
+        lobe = seen.lobe.widened(jnp.full(seen.frame.shape[0], 4 * jnp.pi / (6 * edge**2 * 12), frame.dtype))
 
-    def lit(texel: tuple[Array, Array, Array, Array]) -> Float[Array, "c v"]:
-        direction, area, excess, visible = texel
-        share = points.carry(visible.astype(frame.dtype) / LEVELS)
-        wi = jnp.sum(frame * direction[:, None], 1).T
-        return lobe.evaluate(wi) * jnp.linalg.norm(area) * share * excess[:, None]
+        def lit(texel: tuple[Array, Array, Array, Array], lobe: LobeMixture = lobe) -> Float[Array, "c v"]:
+            direction, area, excess, visible = texel
+            share = points.carry(visible.astype(frame.dtype) / FULL)
+            wi = jnp.sum(frame * direction[:, None], 1).T
+            return lobe.evaluate(wi) * jnp.linalg.norm(area) * share * excess[:, None]
 
-    sent = total(lit, (direction.astype(frame.dtype), area.astype(frame.dtype), light.excess, light.seen)).T
-    return system.system.combine(light.rest, seen.rest, points) + sent
+        sent = sent + total(lit, (direction, area, light.excess[rows], light.seen[rows])).T
+        first += count
+    return sent

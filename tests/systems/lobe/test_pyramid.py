@@ -61,6 +61,22 @@ def test_every_texel_is_its_own_bit(seen):
         np.testing.assert_array_equal(np.asarray(each.visible(every)), (seen >= 8).T)
 
 
+def test_cells_of_all_levels_are_the_means_of_their_texels():
+    size = 32
+    share = np.random.default_rng(2).integers(0, 17, (3, 6, size // 4, size // 4)).repeat(4, 2).repeat(4, 3)
+    share[0, :, ::3] = 0
+    pyramid, scale = lobe.pyramid.pyramid(jnp.asarray(share.reshape(3, -1), jnp.uint8)), lobe.pyramid.scales(size)
+    transport = lobe.LobeTransport(pyramid, jnp.zeros((0, 3), jnp.uint8), jnp.zeros((3, 3)), jnp.zeros((3, 3, 3)), size)
+    area = np.asarray(cubemap.solid_angle(size=size), np.float64)
+    edges = scale.edge.tolist()[1:]
+    every = jax.jit(lambda seen: [seen.cells(jnp.arange(6 * edge**2), edge=edge) for edge in edges])(transport)
+    for number, (edge, found) in enumerate(zip(edges, every, strict=True), 1):
+        bits, fold = number < scale.bits, size // edge
+        value, weight = ((share >= 8) * 1.0, np.ones_like(area)) if bits else (share / 16, area)
+        squares, whole = (x.reshape(-1, 6, edge, fold, edge, fold).sum((3, 5)) for x in (value * weight, weight[None]))
+        np.testing.assert_allclose(found.T, (squares / whole).reshape(3, -1), atol=0.003)
+
+
 @pytest.mark.parametrize("value", [0, 16])
 def test_what_is_open_or_closed_all_around_is_so_at_all_scales(value):
     pyramid = lobe.pyramid.pyramid(jnp.full((2, 6 * SIZE**2), value, jnp.uint8))
