@@ -59,7 +59,7 @@ _MEMORY = 1 << 28  # bytes of pictures that are held at once
         }
     ],
     System=[options.systems(("lobe", "harmonic", "separable", "dynamic"), "One system."), options.NO_BOUNCES],
-    Sizes=options.sizes(lobes=options.SHIPPED_LOBES),
+    Sizes=options.sizes(),
     Output=[
         {"seed": (options.Range(0), 0), "format": (click.Choice(["exr", "png"]), "exr"), "shards": (bool,)},
         options.layers("Layers of EXR files.  [default: color,alpha]"),

@@ -33,7 +33,6 @@ RECIPES: dict[str, type[Recipe]] = {
     "clusters": Clusters,
     "dynamic": Dynamic,
 }
-SHIPPED_LOBES = 8  # the smallest number whose tables are shipped; fewer lobes take less time per look
 
 
 @dataclasses.dataclass(frozen=True)
@@ -277,20 +276,18 @@ def folder(words: str, *, default: str | None = None) -> click.Option:
     return option("output", words, click.Path(path_type=Path), default=default)
 
 
-def _defaults(size: str, lobes: int) -> dict[str, int]:
+def _defaults(size: str) -> dict[str, int]:
     """The systems that have a size, with its default values."""
     values = {name: getattr(recipe(), size, None) for name, recipe in RECIPES.items()}
-    if size == "lobes":
-        values["lobe"] = lobes
     return {name: value for name, value in values.items() if value is not None}
 
 
-def sizes(*names: str, lobes: int = Lobes().lobes) -> list[click.Option]:
+def sizes(*names: str) -> list[click.Option]:
     """Options for some sizes of systems, or all, as their recipes describe them."""
     result = []
     for name in names or _SIZES:
         words: dict[str, list[str]] = {}
-        for system, value in _defaults(name, lobes).items():
+        for system, value in _defaults(name).items():
             words.setdefault(re.split("[;.]", described(RECIPES[system])[name])[0], []).append(f"{system} {value}")
         text = "; ".join(f"{sentence} [default: {', '.join(values)}]" for sentence, values in words.items())
         text += "; several numbers make several systems" * (name == "lobes")
@@ -300,7 +297,7 @@ def sizes(*names: str, lobes: int = Lobes().lobes) -> list[click.Option]:
     return [*result, order, option("window", window, click.Choice(list(LAPLACIAN)), default="laplacian")]
 
 
-FEW_SIZES = sizes("lobes", "texels", lobes=SHIPPED_LOBES)  # of systems that pages show
+FEW_SIZES = sizes("lobes", "texels")  # of systems that pages show
 
 
 def check(chosen: SimpleNamespace, systems: Sequence[str], light: Environment) -> None:
@@ -310,7 +307,7 @@ def check(chosen: SimpleNamespace, systems: Sequence[str], light: Environment) -
         ValueError: A size belongs to another system, or there are more wavelet coefficients than texels.
     """
     for name in _SIZES:
-        takers = _defaults(name, 0)
+        takers = _defaults(name)
         if getattr(chosen, name) is not None and not set(takers) & set(systems):
             raise ValueError(f"--{name} needs --system {' or '.join(takers)}, got {','.join(systems)}")
     texels = 6 * light.radiance.shape[-2] ** 2
@@ -318,7 +315,7 @@ def check(chosen: SimpleNamespace, systems: Sequence[str], light: Environment) -
         raise ValueError(f"--keep must be at most {texels}, got {chosen.keep}")
 
 
-def recipes(system: str, chosen: SimpleNamespace, *, lobes: int = Lobes().lobes) -> dict[str, Recipe]:
+def recipes(system: str, chosen: SimpleNamespace) -> dict[str, Recipe]:
     """The recipes for a system and the options, by names that are used for folders and files."""
     if system not in RECIPES:
         return {system: registry.systems()[system]}
@@ -326,9 +323,9 @@ def recipes(system: str, chosen: SimpleNamespace, *, lobes: int = Lobes().lobes)
         return {system: Harmonics(chosen.order - 1, LAPLACIAN[chosen.window])}
     recipe, sizes = RECIPES[system], {name: getattr(chosen, name, None) for name in _SIZES if name != "lobes"}
     values = {name: value for name, value in sizes.items() if value is not None and hasattr(recipe(), name)}
-    if system not in _defaults("lobes", lobes):  # those with lobes are `Lobes` and `Dynamic`
+    if system not in _defaults("lobes"):  # those with lobes are `Lobes` and `Dynamic`
         return {system: recipe(**values)}
-    counts = chosen.lobes or (_defaults("lobes", lobes)[system],)
+    counts = chosen.lobes or (_defaults("lobes")[system],)
     names = [system] if len(counts) == 1 else [f"{system}_{count}" for count in counts]
     # Tensors are shipped for the default number of lobes.
     without = {count: {"ranks": None} if system == "dynamic" and count != Dynamic().lobes else {} for count in counts}
@@ -342,7 +339,7 @@ def recipe(chosen: SimpleNamespace, what: str) -> Recipe:
     """The recipe of a command that takes one system and one size of it."""
     if len(chosen.system) > 1 or len(chosen.lobes or ()) > 1:
         raise ValueError(f"{what} takes one system and one number of lobes, got several")
-    return next(iter(recipes(chosen.system[0], chosen, lobes=SHIPPED_LOBES).values()))
+    return next(iter(recipes(chosen.system[0], chosen).values()))
 
 
 def make_folder(path: Path | None, *, name: str = "--output") -> None:

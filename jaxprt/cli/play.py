@@ -127,7 +127,7 @@ def prepare(session: Session, chosen: SimpleNamespace) -> None:
     recipes = {
         {"lobe": f"{getattr(recipe, 'lobes', 0)} lobes", "harmonic": "harmonics"}.get(system, name): (system, recipe)
         for system in chosen.system
-        for name, recipe in options.recipes(system, chosen, lobes=options.SHIPPED_LOBES).items()
+        for name, recipe in options.recipes(system, chosen).items()
     }
     session.progress.plan(_stages(len(recipes), refine=bool(refine), bounces=bool(chosen.bounces)))
     report("evaluating materials", None)

@@ -24,9 +24,10 @@ from jaxprt.systems.protocol import Blend, System, VertexSystem
 _ROW = 32  # texels per row, of which only the brightest is sorted at first
 CELLS = 32, 16, 8  # edges of faces in cells: squares of texels whose mean radiance is taken out
 # Edges and numbers of cells that are taken out together, from fine to coarse. The light chooses one of them.
-_PLANS = ((32, 64), (8, 32)), ((16, 64), (8, 64)), ((32, 64),), ((8, 64),)
+_PLANS = ((32, 64), (8, 32)), ((16, 64), (8, 64)), ((8, 64),)
 _JUMP, _WITHIN = 16, 0.1  # edge of the means whose steps lobes cannot follow, and what steps within them count
 _WIDE = 4  # edge of the means about which steps are counted
+_SMOOTH = 2  # sample points along the edge of a texel of the smoothest BRDF for which cells are summed
 FULL = 240  # the share of a texel or cell that is all visible: sixteenths and quarters are whole numbers
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
 _TOGETHER = 32  # texels whose visibility is read at once
@@ -268,9 +269,8 @@ def _plans(levels: Sequence[int]) -> list[tuple[tuple[int, int], ...]]:
 
 
 def levels_for(samples: int, size: int) -> tuple[int, ...]:
-    """Levels of cells for a BRDF, by its sample points along the edge of a texel: none wider than its lobe."""
-    fine = [edge for edge in CELLS if edge < size]
-    return tuple(fine if samples <= 2 else fine[:1])
+    """Levels of cells for a BRDF, by its sample points along the edge of a texel; none for very narrow lobes."""
+    return tuple(edge for edge in CELLS if edge < size) if samples <= _SMOOTH else ()
 
 
 def cell_counts(levels: Sequence[int]) -> list[int]:
