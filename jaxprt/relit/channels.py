@@ -413,26 +413,6 @@ def _check_opacity(part: Part, material: TexturedMaterial) -> None:
         )
 
 
-def at_points(part: Part, shading: Shading, material: Any, points: Points) -> Appearance:
-    """Evaluates a material at points of a part. Its textures are averaged over the pixel of each point.
-
-    Args:
-        part: The part.
-        shading: The `Shading` of the part, from `of_part`.
-        material: A material that `appearance` takes, an `Appearance` at the vertices, or None for the part's own
-            material.
-        points: Points on the part's triangles.
-    """
-    if isinstance(material, Appearance):
-        return jax.tree.map(points.carry, material)
-    if shading.blend is None:
-        return Appearance(None)
-    if material is not None:
-        part = dataclasses.replace(part, material=material)
-    look = material_table.of_parts([part]).at(points)
-    return Appearance(shading.blend_at(look), look.emitted)
-
-
 def materials_at(parts: Sequence[Part], shading: Shading, points: Points) -> tuple[Blend | None, Callable]:
     """The materials of several parts of one kind at points on all of them: weights of the channels, and the BRDF.
 

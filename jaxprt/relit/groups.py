@@ -83,11 +83,6 @@ class Surface(eqx.Module):
             return self
         return dataclasses.replace(self, reflecting=self.reflecting.harmonics_alone)
 
-    @property
-    def channels(self) -> int:
-        """Number of channels of the BRDF whose weights may vary."""
-        return 1 if self.scale is None else len(self.term)
-
 
 def sampled(surface: Surface, samples: int) -> Surface:
     """The surface with another number of sample points along the edge of each bright texel."""
