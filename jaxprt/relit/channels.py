@@ -73,6 +73,11 @@ class Shading(eqx.Module):
     table: StandardTable | None = eqx.field(static=True, default=None)
 
     @property
+    def appearance(self) -> "Appearance":
+        """The material at the vertices."""
+        return Appearance(self.blend, self.emitted)
+
+    @property
     def matte(self) -> bool:
         """Whether the surface is ideally diffuse."""
         return getattr(self.brdf, "matte", False)
@@ -566,16 +571,6 @@ def _tangents(normal: Array, tangent: Array, surface: MaterialValues) -> Array:
     frame = directions.frame(normal, tangent)
     along = jnp.einsum("vi,vij->vj", surface.direction, frame[:, :2], precision="highest")
     return directions.frame(normal, along)[:, 0]
-
-
-def precomputed(shading: Shading) -> Appearance:
-    """The material that a part was precomputed with."""
-    return Appearance(shading.blend, shading.emitted)
-
-
-def is_model(material: Any) -> bool:
-    """Whether a material is a model that is evaluated at vertices and points."""
-    return isinstance(material, Changeable)
 
 
 def check_blend(name: str, shading: Shading, blend: Blend | None) -> None:
