@@ -276,7 +276,7 @@ class Arriving(NamedTuple):
 
 
 class Stage(eqx.Module):
-    """A scene with its materials at present, as pictures and reflections take it.
+    """A scene with its materials at present: all that its methods, pictures and reflections read of materials.
 
     What is done for each row of points is a function and not a method: Equinox flattens an object whenever one of its
     methods is used.
@@ -284,7 +284,7 @@ class Stage(eqx.Module):
     Attributes:
         whole: The mesh of all parts, whose regions are the parts.
         mesh: The same mesh, padded to shared sizes with faces without area.
-        surfaces: One `Surface` for each group.
+        surfaces: One `Surface` for each group, as precomputed; `surface_of` has the rays that the materials need.
         table: The materials of all parts.
         appearance: The materials at the vertices of each group.
         fixed: For each group, materials that users give at vertices; None without.
