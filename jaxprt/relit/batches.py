@@ -13,13 +13,12 @@ from jaxtyping import Array, Float, Int
 
 from jaxprt import require
 from jaxprt.relit import groups
-from jaxprt.relit.groups import Arriving, Surface
+from jaxprt.relit.groups import Arriving, Stage
 from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.surface import under_lights
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.environment import resized
 from jaxprt.systems.bounces import GroupBounces
-from jaxprt.systems.protocol import Blend
 
 _HELD = 3  # arrays of the size of a picture that are held for each picture while it is made
 _BYTES = 16  # of a pixel of four channels
@@ -147,35 +146,32 @@ def stacked(pictures: Iterator[PictureBlock], lights: int, views: int) -> Any:
 
 
 def radiance(
-    surfaces: Sequence[Surface],
+    stage: Stage,
     bounces: GroupBounces | None,
     lights: Float[Array, "l 6 n n c"],
-    blends: Sequence[Blend | None],
-    lamp: Float[Array, "k 3"] | None,
     view: Any,
     order: Int[Array | np.ndarray, " v"],
 ) -> Float[Array, "l v c"]:
     """Radiance of the vertices of a scene, or of points on it, under several lights.
 
     Args:
-        surfaces: The groups.
+        stage: The scene and its materials.
         bounces: The system of reflected light; None without bounces.
         lights: Radiance of the environments.
-        blends: Weights of the channels at the vertices of each group.
-        lamp: Radiance of each lamp; None without lamps.
         view: The view of the scene, without traced reflections.
         order: Index of each vertex or point among those of all groups.
     """
-    reflected: Sequence[Any] = (None,) * len(surfaces)
+    reflected: Sequence[Any] = (None,) * len(stage.surfaces)
     if bounces is not None:
 
         def arriving(radiance: Float[Array, "6 n n c"]) -> tuple[Array, ...]:
-            return bounces.shade(bounces.light(Environment(radiance)), blends, lamp)
+            return bounces.shade(bounces.light(Environment(radiance)), stage.blends, stage.radiance)
 
         reflected = jax.vmap(arriving)(lights)
-    tilts, result = view.stage.table.frame is not None, []
-    parts = zip(surfaces, groups.projected(surfaces, lights), reflected, blends, view.group, strict=True)
+    tilts, result = stage.table.frame is not None, []
+    direct = groups.projected(stage.surfaces, lights)
+    parts = zip(stage.surfaces, direct, reflected, stage.blends, view.group, strict=True)
     for group, (surface, *rows, blend, viewed) in enumerate(parts):
-        surface = groups.sampled(surface, max(view.stage.layout.of_group(group, view.stage.samples)))
-        result.append(under_lights(surface, tuple(rows), lamp, blend, viewed, tilts=tilts))
+        surface = groups.sampled(surface, max(stage.layout.of_group(group, view.stage.samples)))
+        result.append(under_lights(surface, tuple(rows), stage.radiance, blend, viewed, tilts=tilts))
     return jax.vmap(groups.ordered, (0, None))(tuple(result), jnp.asarray(order))

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxprt.compile import jit, known, put
 from jaxprt.image.pixels import Pixels, by_color, pixel_angle
+from jaxprt.relit.groups import Stage
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.environment import background
 from jaxprt.scene.points import Points
@@ -42,17 +43,15 @@ def rows_of(
     return pad(index, (0, rows * ROW - count), constant_values=-1).reshape(rows, ROW).astype(np.int32)
 
 
-def points_of(
-    pixels: Pixels, face: Int[Array | np.ndarray, "f 3"], shift: Int[Array | np.ndarray, " v"], index: Any
-) -> tuple[Points, Points]:
+def points_of(stage: Stage, pixels: Pixels, index: Any) -> tuple[Points, Points]:
     """Some points of a picture that lie on one group: on the mesh of all parts, and on the group.
 
     Args:
+        stage: The scene.
         pixels: The points of the picture.
-        face: Triangles of the mesh of all parts.
-        shift: Index of each vertex in this mesh, minus its index in its group.
         index: Indices of the points; -1 in padding, which repeats the first point.
     """
+    face, shift = stage.face, stage.shift
     xp: Any = np if known(pixels, face, shift, index) else jnp
     index = xp.where(index < 0, xp.maximum(index[0], 0), index)
     corner = xp.asarray(face)[xp.maximum(xp.asarray(pixels.triangle)[index], 0)].T

@@ -73,6 +73,11 @@ class Shading(eqx.Module):
     table: StandardTable | None = eqx.field(static=True, default=None)
 
     @property
+    def appearance(self) -> "Appearance":
+        """The material at the vertices."""
+        return Appearance(self.blend, self.emitted)
+
+    @property
     def matte(self) -> bool:
         """Whether the surface is ideally diffuse."""
         return getattr(self.brdf, "matte", False)
@@ -413,26 +418,6 @@ def _check_opacity(part: Part, material: TexturedMaterial) -> None:
         )
 
 
-def at_points(part: Part, shading: Shading, material: Any, points: Points) -> Appearance:
-    """Evaluates a material at points of a part. Its textures are averaged over the pixel of each point.
-
-    Args:
-        part: The part.
-        shading: The `Shading` of the part, from `of_part`.
-        material: A material that `appearance` takes, an `Appearance` at the vertices, or None for the part's own
-            material.
-        points: Points on the part's triangles.
-    """
-    if isinstance(material, Appearance):
-        return jax.tree.map(points.carry, material)
-    if shading.blend is None:
-        return Appearance(None)
-    if material is not None:
-        part = dataclasses.replace(part, material=material)
-    look = material_table.of_parts([part]).at(points)
-    return Appearance(shading.blend_at(look), look.emitted)
-
-
 def materials_at(parts: Sequence[Part], shading: Shading, points: Points) -> tuple[Blend | None, Callable]:
     """The materials of several parts of one kind at points on all of them: weights of the channels, and the BRDF.
 
@@ -586,16 +571,6 @@ def _tangents(normal: Array, tangent: Array, surface: MaterialValues) -> Array:
     frame = directions.frame(normal, tangent)
     along = jnp.einsum("vi,vij->vj", surface.direction, frame[:, :2], precision="highest")
     return directions.frame(normal, along)[:, 0]
-
-
-def precomputed(shading: Shading) -> Appearance:
-    """The material that a part was precomputed with."""
-    return Appearance(shading.blend, shading.emitted)
-
-
-def is_model(material: Any) -> bool:
-    """Whether a material is a model that is evaluated at vertices and points."""
-    return isinstance(material, Changeable)
 
 
 def check_blend(name: str, shading: Shading, blend: Blend | None) -> None:

@@ -83,11 +83,6 @@ class Surface(eqx.Module):
             return self
         return dataclasses.replace(self, reflecting=self.reflecting.harmonics_alone)
 
-    @property
-    def channels(self) -> int:
-        """Number of channels of the BRDF whose weights may vary."""
-        return 1 if self.scale is None else len(self.term)
-
 
 def sampled(surface: Surface, samples: int) -> Surface:
     """The surface with another number of sample points along the edge of each bright texel."""
@@ -232,6 +227,16 @@ class Layout(eqx.Module):
         columns = tuple(self.column(group, rows) for rows in parameter)
         return Appearance(Blend(self.column(group, wide), columns), emitted)
 
+    def fixed(self, group: int, look: Appearance, chosen: Sequence[bool]) -> VertexMaterials | None:
+        """Materials that users give at the vertices of some parts, out of all materials of a group; None without."""
+        flags, counts = self.of_group(group, chosen), self.of_group(group, self.counts)
+        if look.blend is None or not any(flags):
+            return None
+        dtype = jnp.result_type(float)
+        flag = self.column(group, [np.full(*row, dtype) for row in zip(counts, flags, strict=True)])
+        emitted = np.zeros((self.size[group], 3), dtype) if look.emitted is None else look.emitted
+        return put(VertexMaterials(look.blend, emitted, flag))
+
 
 def _colored(weight: Any, colors: int) -> Any:
     """Weights repeated to a number of colors."""
@@ -271,7 +276,7 @@ class Arriving(NamedTuple):
 
 
 class Stage(eqx.Module):
-    """A scene with its materials at present, as pictures and reflections take it.
+    """A scene with its materials at present: all that its methods, pictures and reflections read of materials.
 
     What is done for each row of points is a function and not a method: Equinox flattens an object whenever one of its
     methods is used.
@@ -279,34 +284,38 @@ class Stage(eqx.Module):
     Attributes:
         whole: The mesh of all parts, whose regions are the parts.
         mesh: The same mesh, padded to shared sizes with faces without area.
-        surfaces: One `Surface` for each group.
+        surfaces: One `Surface` for each group, as precomputed; `surface_of` has the rays that the materials need.
         table: The materials of all parts.
-        rough: The roughness of all parts alone, where JAX traces other parameters; None where the table is known.
+        appearance: The materials at the vertices of each group.
         fixed: For each group, materials that users give at vertices; None without.
-        bend: Curvature of the radiance of each vertex, from `curvature.of_part`.
+        curvature: How fast the radiance of each part varies with direction, from `jaxprt.relit.curvature.of_part`.
         layout: Where the vertices of the parts stand.
         samples: Number of sample points along the edge of each bright texel, for each part.
         sharp: Whether narrow lobes of each part are traced by rays.
+        rays: Number of reflection rays that each vertex or point of a sharp part sends.
         lamp: Index of the lamp that each part is; -1 for a part that does not emit.
         hidden: Whether cameras see through the backs of each part.
         point_lights: The point lights, in the coordinates of the mesh.
         power: Power of each lamp as precomputed, by which lamps share rays; None without lamps.
+        radiance: Radiance of each lamp; for a point light, its intensity. None without lamps.
     """
 
     whole: Mesh
     mesh: Mesh
     surfaces: tuple[Surface, ...]
     table: MaterialTable
-    rough: MaterialTable | None
+    appearance: tuple[Appearance, ...]
     fixed: tuple[VertexMaterials | None, ...]
-    bend: Float[Array, " v"]
+    curvature: Float[Array | np.ndarray, " n"]
     layout: Layout
     samples: tuple[int, ...] = eqx.field(static=True)
     sharp: tuple[bool, ...] = eqx.field(static=True)
+    rays: int = eqx.field(static=True)
     lamp: tuple[int, ...] = eqx.field(static=True)
     hidden: tuple[bool, ...] = eqx.field(static=True)
     point_lights: tuple[PointLight, ...] = ()
-    power: Float[Array | np.ndarray, " n"] | None = None
+    power: Float[Array | np.ndarray, " l"] | None = None
+    radiance: Float[Array, "l 3"] | None = None
 
     @property
     def hidden_faces(self) -> Bool[Array | np.ndarray, " f"] | None:
@@ -329,13 +338,24 @@ class Stage(eqx.Module):
         return self.layout.shift[self.part]
 
     @property
+    def blends(self) -> list[Blend | None]:
+        """Weights of the channels at the vertices of each group."""
+        return [look.blend for look in self.appearance]
+
+    @property
+    def bend(self) -> Float[Array, " v"]:
+        """Curvature of the radiance of each vertex of the padded mesh."""
+        part = np.pad(self.part, (0, len(self.mesh.position) - len(self.part)), mode="edge")
+        return put(np.asarray(self.curvature)[part]) if known(self.curvature) else jnp.asarray(self.curvature)[part]
+
+    @property
     def sharp_groups(self) -> list[int]:
         """Indices of the groups from which reflection rays start."""
-        return [group for group, surface in enumerate(self.surfaces) if surface.has_rays]
+        return [group for group in range(len(self.surfaces)) if _has_rays(self, group)]
 
     def sharp_at(self, group: int, points: Points) -> Float[Array, " p"] | None:
         """1 at points of the scene whose narrow lobes are traced, 0 at others; None for a group without rays."""
-        if group not in self.sharp_groups:
+        if not _has_rays(self, group):
             return None
         flag = np.asarray(self.sharp, jnp.result_type(float))[self.part]
         if known(points):
@@ -350,9 +370,22 @@ class Stage(eqx.Module):
             points: The points in the scene.
             on_group: The same points on the group, which the second result is made of.
         """
-        look = look_at(self.table, self.rough, points)
-        with compile_time(look, on_group, self.fixed[group], self.surfaces[group].scale):
-            return material(self.surfaces[group], on_group, look, self.fixed[group])[0], on_group.tilted(look.normal)
+        look, surface = self.table.at(points), surface_of(self, group)
+        with compile_time(look, on_group, self.fixed[group], surface.scale):
+            return material(surface, on_group, look, self.fixed[group])[0], on_group.tilted(look.normal)
+
+
+def _has_rays(stage: Stage, group: int) -> bool:
+    """Whether reflection rays start from a group: some of its parts are sharp."""
+    return stage.rays > 0 and stage.surfaces[group].has_rays and any(stage.layout.of_group(group, stage.sharp))
+
+
+def surface_of(stage: Stage, group: int) -> Surface:
+    """A group of a stage, with rays for its reflections if any of its parts is sharp."""
+    surface = stage.surfaces[group]
+    if surface.reflecting is None or not _has_rays(stage, group):
+        return surface.without_rays
+    return dataclasses.replace(surface, reflecting=dataclasses.replace(surface.reflecting, count=stage.rays))
 
 
 def check_points(points: Any, counts: Sequence[int]) -> None:
@@ -477,15 +510,6 @@ def surface(
     return Surface(system, position, frame, brdf, reflecting, lit, scale, shading.term, varies)
 
 
-def spread(values: Sequence[Any], counts: Sequence[int], size: int, dtype: Any) -> Any:
-    """A value of each part at all its vertices, padded."""
-    part = np.repeat(np.arange(len(counts)), counts)
-    part = np.pad(part, (0, max(size - len(part), 0)), mode="edge")
-    if known(values):
-        return put(np.asarray([float(value) for value in values], dtype)[part])
-    return jnp.stack([jnp.asarray(value, dtype) for value in values])[part]
-
-
 def padded(mesh: Mesh) -> Mesh:
     """A mesh relative to its origin, padded to shared sizes: vertices repeat the last one, and faces have no area."""
     if not known(mesh):
@@ -504,23 +528,6 @@ def ordered(colors: tuple[Float[Array, "_ _"], ...], order: Int[Array, " v"]) ->
     """Colors of all vertices in the order of the scene, from those of the groups."""
     most = max(rows.shape[1] for rows in colors)
     return jnp.concatenate([jnp.broadcast_to(rows, (len(rows), most)) for rows in colors])[order]
-
-
-def look_at(table: MaterialTable, rough: MaterialTable | None, points: Points) -> MaterialLook:
-    """The materials at points.
-
-    Args:
-        table: The materials.
-        rough: Their roughness alone, if JAX traces other parameters, so that roughness is known; else None.
-        points: Points of the scene.
-    """
-    with compile_time(table, points):
-        look = table.at(points)
-    if rough is None:
-        return look
-    with compile_time(rough, points):
-        plain = rough.at(points)
-    return look._replace(log_roughness=plain.log_roughness, log_layer=plain.log_layer)
 
 
 @jit

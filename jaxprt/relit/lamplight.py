@@ -60,9 +60,9 @@ class LampLight:
 
     def _places_for(self, group: int) -> LampPlaces:
         """Places on the lamps for the points of a group."""
-        layout, bend = self.stage.layout, self.stage.bend
+        curvature, parts = self.stage.curvature, list(self.stage.layout.parts[group])
         # Roughness that JAX traces may become small.
-        smooth = not known(bend) or np.asarray(bend)[layout.first[list(layout.parts[group])]].max() > _SMOOTH
+        smooth = not known(curvature) or np.asarray(curvature)[parts].max() > _SMOOTH
         few = sum(lamp >= 0 for lamp in self.stage.lamp) <= _MANY
         pieces = _FINE if smooth and few else _COARSE
         if pieces not in self._places:

@@ -77,19 +77,18 @@ class SceneLamps(eqx.Module):
         return (*(parts[part] for part in self.emitting), *(light.name for light in self.point_lights))
 
     def sources(
-        self, appearances: Sequence[Appearance], origin: origins.Origin
+        self, radiance: Float[Array, "n 3"], origin: origins.Origin
     ) -> tuple[tuple[PointLight, ...], Float[Array | np.ndarray, " n"]]:
         """The point lights relative to an origin, and the power of each lamp.
 
         Args:
-            appearances: Materials of all parts at their vertices.
+            radiance: Radiance of each lamp.
             origin: The origin.
         """
         lights = tuple(
             dataclasses.replace(light, position=origins.local(f"point light {light.name!r}", light.position, origin))
             for light in self.point_lights
         )
-        radiance = self.radiance(appearances, {})
         xp = np if known(radiance, self.area) else jnp
         surface = [np.pi * xp.sum(xp.asarray(area)) for area in self.area]
         return lights, xp.asarray([*surface, *(4 * np.pi for _ in lights)]) * xp.mean(xp.asarray(radiance), -1)

@@ -18,7 +18,7 @@ from jaxprt import require
 from jaxprt.files.outputs import LAYERS
 from jaxprt.image.pixels import Pixels
 from jaxprt.relit import canvas
-from jaxprt.relit.groups import Stage, look_at
+from jaxprt.relit.groups import Stage
 from jaxprt.scene import Camera
 
 LIGHT = ("color", "direct", "reflected")  # layers that depend on the light
@@ -87,8 +87,8 @@ def _gray(pixels: Pixels) -> Pixels:
 
 def _materials(stage: Stage, pixels: Pixels, group: int, index: Int[np.ndarray, " p"]) -> dict[str, Any]:
     """Normals, base colors and roughness at points of a row."""
-    points, on_group = canvas.points_of(pixels, stage.face, stage.shift, index)
-    look = look_at(stage.table, stage.rough, points)
+    points, on_group = canvas.points_of(stage, pixels, index)
+    look = stage.table.at(points)
     surface = stage.surfaces[group]
     normal, albedo = on_group.tilted(look.normal).frame(surface.frame)[:, 2], look.values.base_color
     if surface.scale is None and surface.matte:  # of a BRDF that cannot change

@@ -19,12 +19,10 @@ from jaxprt.files import outputs
 from jaxprt.image import raster
 from jaxprt.image.pixels import Pixels, visible_points
 from jaxprt.programs.executables import make_room
-from jaxprt.relit import canvas, curvature, groups, lamplight, shadows, tracing
+from jaxprt.relit import canvas, curvature, lamplight, shadows, tracing
 from jaxprt.relit.casting import caster
-from jaxprt.relit.channels import Appearance
-from jaxprt.relit.groups import Arriving, SceneLight, Stage, Surface, look_at, sampled
+from jaxprt.relit.groups import Arriving, Stage, Surface, sampled, surface_of
 from jaxprt.relit.lamplight import LampLight
-from jaxprt.relit.lamps import split
 from jaxprt.relit.picture_layers import LIGHT
 from jaxprt.relit.picture_layers import check as check_layers
 from jaxprt.relit.picture_layers import of_points as geometry_layers
@@ -245,27 +243,6 @@ class PictureView(eqx.Module):
         return result
 
 
-class SceneLighting(eqx.Module):
-    """The light that arrives at a scene with given materials, as a function of the environment.
-
-    Direct light may be that of another environment, and lamps may have a share of their radiance.
-    """
-
-    scene: Any
-    materials: Any
-    appearances: dict[str, Appearance]
-
-    def __call__(
-        self, environment: Environment, direct: Environment | None, share: Float[np.ndarray, " n"] | None
-    ) -> Arriving:
-        """The arriving light."""
-        lights = split(self.scene.lamps, self.materials)[1]
-        light = self.scene.light(environment)
-        if direct is not None:
-            light = SceneLight(groups.direct(self.scene.surfaces, direct), light.transferred)
-        return self.scene.shade_lamps(light, {**self.appearances, **lights}, share)
-
-
 class RowLight(NamedTuple):
     """The light that arrives at the points of a row.
 
@@ -378,7 +355,7 @@ def _colors_of_row(
     recompute: bool,
 ) -> list[tuple[Float[Array, "*m p c"], ...]]:
     """Colors of the points of a row under each light; also of direct light if `apart`."""
-    surface = sampled(picture.stage.surfaces[row.group], row.samples)
+    surface = sampled(surface_of(picture.stage, row.group), row.samples)
     if row.index.ndim == 2:  # of a view that was made inside of `jax.jit`
         return [_colors_of_some(picture, row, light, apart=apart) for light in lights]
     if isinstance(row.viewed, Viewed):
@@ -398,9 +375,9 @@ def _shaded(
     lights: Sequence[RowLight],
 ) -> list[tuple[Float[Array, "p c"], ...]]:
     """Colors of some points of a row under each light, with a view that is not stored."""
-    points, on_group = _points(picture, index)
+    points, on_group = canvas.points_of(picture.stage, picture.pixels, index)
     transport = None if lamps is None else lamps.row(row.group, index, on_group)
-    seen = _seen(picture.stage, surface, row.group, points, on_group, picture.camera, lamps=transport)
+    seen = _seen(picture.stage, row.group, points, on_group, picture.camera, lamps=transport)
     return [_lit(surface, row, index, seen, light, apart=apart) for light in lights]
 
 
@@ -427,7 +404,7 @@ def _colors_of_some(
     picture: PictureView, row: Row, light: RowLight, *, apart: bool
 ) -> tuple[Float[Array, "m p c"], ...]:
     """`_shaded` under one light inside of `jax.jit`, where most rows may be padding alone."""
-    surface = sampled(picture.stage.surfaces[row.group], row.samples)
+    surface = sampled(surface_of(picture.stage, row.group), row.samples)
 
     def shade(index: Array, light: RowLight) -> tuple[Array, ...]:
         return _shaded(picture, surface, row, index, None, apart, [light])[0]
@@ -442,17 +419,12 @@ def _colors_of_some(
     return jax.lax.map(some, row.index)
 
 
-def _points(picture: PictureView, index: Any) -> tuple[Points, Points]:
-    return canvas.points_of(picture.pixels, picture.stage.face, picture.stage.shift, index)
-
-
 def make(
+    scene: Any,
     stage: Stage,
-    arriving: "SceneLighting",
     camera: Camera,
     *,
     samples: int,
-    lamps: tuple[str, ...],
     keep: bool,
     shadow: str | Environment,
     between: Between,
@@ -460,11 +432,10 @@ def make(
     """Finds the shaded points of a picture, and computes what depends on the camera and the materials.
 
     Args:
+        scene: The relit scene.
         stage: The scene and its materials.
-        arriving: Function from an environment to the light that arrives at the scene; see `PictureView`.
         camera: The camera, relative to the origin of the scene.
         samples: Number of coverage samples of each pixel: 1, 4 or 16.
-        lamps: Names of the lamps.
         keep: Whether to store what depends on the view, for many lights: about a kilobyte for each point.
         shadow: "rays" or "vertices", or the light whose brightest texels are traced for all lights.
         between: Function that is called between steps of the work, as in `RelitScene.picture`.
@@ -473,25 +444,24 @@ def make(
         ValueError: `samples` is not 1, 4 or 16, or `shadow` is another word.
     """
     if isinstance(shadow, Environment):
-        check(arriving.scene, [shadow])
+        check(scene, [shadow])
     elif shadow not in ("rays", "vertices"):
         raise ValueError(f'shadows must be "rays", "vertices" or an Environment, got {require.shown(shadow)}')
     samples, camera, fold = drawn(camera, samples)
     make_room()
-    with compile_time(stage.mesh, camera, stage.bend) if stage.sharp_groups else contextlib.nullcontext():
+    with compile_time(stage.mesh, camera, stage.curvature) if stage.sharp_groups else contextlib.nullcontext():
         pixels, rows = _placed(stage, camera, samples, between)
     rays = isinstance(shadow, Environment) or shadow == "rays"
     lit = lamplight.of(stage, pixels, camera.width) if rays else None
     complete, origins, sharp = [], [], stage.sharp_groups
     for row in rows:
-        surface = sampled(stage.surfaces[row.group], row.samples)
         stores = keep and not isinstance(row.index, Tracer)
         if stores or row.group in sharp:
             index = row.index if row.index.ndim == 1 else row.index[0]
-            points, on_group = canvas.points_of(pixels, stage.face, stage.shift, index)
+            points, on_group = canvas.points_of(stage, pixels, index)
             transport = None if lit is None else lit.row(row.group, index, on_group)
             if stores:
-                seen = _seen(stage, surface, row.group, points, on_group, camera, lamps=transport)
+                seen = _seen(stage, row.group, points, on_group, camera, lamps=transport)
                 row = dataclasses.replace(row, viewed=seen)
             if row.group in sharp:
                 blend, tilted = stage.blend(row.group, points, on_group)
@@ -506,9 +476,10 @@ def make(
         shares = None if traced is None else put(traced.shares)
     else:
         way = shadow
-    scene = arriving.scene
+    lamps = () if scene.lamps is None else scene.lamps.names(scene.scene.names)
     more = {"shares": shares, "lamp_rays": rays, "lamps": lamps}
     more |= {"light_size": scene.light_size, "light_step": scene.light_step}
+    arriving = eqx.Partial(scene.arriving, stage)
     return PictureView(stage, arriving, camera, pixels, ray, tuple(complete), reflected, fold, way, keep, **more)
 
 
@@ -525,19 +496,12 @@ def drawn(camera: Camera, samples: int) -> tuple[int, Camera, int]:
 
 
 def _seen(
-    stage: Stage,
-    surface: Surface,
-    group: int,
-    points: Points,
-    on_group: Points,
-    camera: Camera,
-    lamps: LampTransport | None = None,
+    stage: Stage, group: int, points: Points, on_group: Points, camera: Camera, lamps: LampTransport | None = None
 ) -> Viewed:
     """What does not depend on the light, for a row of points with their materials."""
-    look, eye = look_at(stage.table, stage.rough, points), jnp.asarray(camera.eye)
+    surface = sampled(surface_of(stage, group), 1)  # The view does not depend on the samples of bright texels.
     options = {"fixed": stage.fixed[group], "sharp": stage.sharp_at(group, points), "lamps": lamps}
-    # The view does not depend on the samples of bright texels.
-    return view(sampled(surface, 1), on_group, look, eye, **options)
+    return view(surface, on_group, stage.table.at(points), jnp.asarray(camera.eye), **options)
 
 
 def folded(picture: Float[Array, "h w c"], *, fold: int) -> Float[Array, "_ _ c"]:

@@ -21,7 +21,7 @@ from jaxprt.relit import batches, channels, groups, measuring, pictures, reflect
 from jaxprt.relit import lamps as scene_lamps
 from jaxprt.relit.casting import caster
 from jaxprt.relit.channels import Appearance, Changeable, Shading, appearance
-from jaxprt.relit.groups import Arriving, Layout, SceneLight, Stage, Surface, VertexMaterials
+from jaxprt.relit.groups import Arriving, Layout, SceneLight, Stage, Surface
 from jaxprt.relit.lamps import SceneLamps
 from jaxprt.relit.pictures import PictureView
 from jaxprt.relit.refinement import MeshDivision
@@ -66,40 +66,21 @@ class RelitScene(System):
     Attributes:
         scene: The scene.
         shading: Mesh, BRDF and channel weights of each part.
-        layout: Where the vertices of the parts stand in the groups.
-        surfaces: One `Surface` for each group of parts of one kind.
-        appearance: The materials at the vertices of each group.
+        stage: The groups of parts of one kind, with the materials that they were precomputed with.
         bounces: The system of light that the parts reflect onto each other; None without bounces.
         lamps: Emitting parts and point lights; None if there are none.
-        mesh: The mesh of all parts, with the original normals (without normal maps).
-        drawn: The same mesh, padded.
-        table: The materials of all parts as columns.
         camera: The first camera of the scene. If it has none, a camera that shows the whole scene from slightly above.
             Cameras, eyes and point lights are in the coordinates of the scene's file.
-        curvature: How fast the radiance of each part varies with direction, from
-            `jaxprt.relit.curvature.of_part`.
-        samples: Number of sample points along the edge of each bright texel, for each part.
-        sharp: Whether reflections of each part are traced.
-        rays: Number of reflection rays that each vertex or point of a sharp part sends.
         division: How the meshes were divided; None for the meshes as they were.
         copied: For each part, the vertices of the file that have a copy for their back. The copies follow the file's.
     """
 
     scene: Scene
     shading: tuple[Shading, ...]
-    layout: Layout
-    surfaces: tuple[Surface, ...]
-    appearance: tuple[Appearance, ...]
+    stage: Stage
     bounces: GroupBounces | None
     lamps: SceneLamps | None
-    mesh: Mesh
-    drawn: Mesh
-    table: MaterialTable
     camera: Camera
-    curvature: Float[np.ndarray | Array, " n"]
-    samples: tuple[int, ...] = eqx.field(static=True)
-    sharp: tuple[bool, ...] = eqx.field(static=True)
-    rays: int = eqx.field(static=True)
     division: MeshDivision | None
     copied: tuple[Int[np.ndarray, " _"], ...]
 
@@ -141,13 +122,9 @@ class RelitScene(System):
             for part in scene.parts
         ]
         self.scene = dataclasses.replace(scene, parts=parts)
-        self.shading, self.layout, self.bounces, self.lamps = tuple(shading), layout, bounces, lamps
-        self.mesh, self.rays = scene.mesh, rays
-        self.drawn = groups.padded(self.mesh)
-        self.table = jax.device_put(material_table.of_parts(self.scene.parts))
-        first = [channels.precomputed(part) for part in shading]
-        self.appearance = tuple(jax.device_put(layout.gathered(group, first)) for group in range(len(systems)))
-        self.surfaces = tuple(
+        self.shading, self.bounces, self.lamps = tuple(shading), bounces, lamps
+        mesh, looks = scene.mesh, [part.appearance for part in shading]
+        surfaces = tuple(
             groups.surface(
                 group,
                 shading,
@@ -158,11 +135,43 @@ class RelitScene(System):
             )
             for group, system in enumerate(systems)
         )
-        pairs = zip(shading, layout.group, strict=True)
-        traits = (reflection.traits(part, self.surfaces[group]) for part, group in pairs)
+        traits = [reflection.traits(part, surfaces[group]) for part, group in zip(shading, layout.group, strict=True)]
         curvature, samples, sharp = zip(*traits, strict=True)
-        self.curvature, self.samples, self.sharp = np.asarray(curvature, self.mesh.position.dtype), samples, sharp
-        self.camera = scenes.default_camera(scene, self.mesh)
+        emitting = [] if lamps is None else list(lamps.emitting)
+        radiance = None if lamps is None else lamps.radiance(looks, {})
+        self.stage = Stage(
+            mesh,
+            groups.padded(mesh),
+            surfaces,
+            jax.device_put(material_table.of_parts(self.scene.parts)),
+            tuple(jax.device_put(layout.gathered(group, looks)) for group in range(len(systems))),
+            (None,) * len(systems),
+            np.asarray(curvature, mesh.position.dtype),
+            layout,
+            samples,
+            sharp,
+            rays,
+            tuple(emitting.index(part) if part in emitting else -1 for part in range(len(shading))),
+            tuple(sides.hidden_backs(self.scene).tolist()),
+            *(((), None) if lamps is None or radiance is None else lamps.sources(radiance, mesh.origin)),
+            radiance,
+        )
+        self.camera = scenes.default_camera(scene, mesh)
+
+    @property
+    def mesh(self) -> Mesh:
+        """The mesh of all parts, with the original normals (without normal maps)."""
+        return self.stage.whole
+
+    @property
+    def layout(self) -> Layout:
+        """Where the vertices of the parts stand in the groups."""
+        return self.stage.layout
+
+    @property
+    def surfaces(self) -> tuple[Surface, ...]:
+        """One `Surface` for each group of parts of one kind."""
+        return self.stage.surfaces
 
     @property
     def file_vertex(self) -> Int[np.ndarray, " _"]:
@@ -190,13 +199,13 @@ class RelitScene(System):
     def without_bounces(self) -> "RelitScene":
         """The scene without light that its parts reflect onto each other."""
         surfaces = tuple(dataclasses.replace(surface, reflecting=None) for surface in self.surfaces)
-        return self._replaced(surfaces=surfaces, bounces=None)
+        return self._replaced(dataclasses.replace(self.stage, surfaces=surfaces), bounces=None)
 
-    def _replaced(self, **fields: Any) -> "RelitScene":
-        """A copy with other fields. Works inside `jax.jit` too, where `__init__` could not measure the curvature."""
-        copy = object.__new__(RelitScene)
-        for field in dataclasses.fields(self):
-            object.__setattr__(copy, field.name, fields.get(field.name, getattr(self, field.name)))
+    def _replaced(self, stage: Stage, **fields: Any) -> "RelitScene":
+        """A copy with another stage. Works inside `jax.jit` too, where `__init__` could not measure the curvature."""
+        copy, fields = object.__new__(RelitScene), {**vars(self), "stage": stage, **fields}
+        for name, value in fields.items():
+            object.__setattr__(copy, name, value)
         return copy
 
     @promoted
@@ -206,33 +215,41 @@ class RelitScene(System):
         return groups.light(self.surfaces, self.bounces, environment)
 
     @promoted
-    def shade(self, light: SceneLight, materials: Mapping[str, Any] | None = None) -> Arriving:
+    def shade(self, light: SceneLight, materials: Mapping[str, Any] | Stage | None = None) -> Arriving:
         """The light that arrives at all groups, given the materials. Redone when the light or the materials change."""
-        return self.shade_lamps(light, materials)
+        return self._shade(light, self._stage(materials))
 
-    def shade_lamps(
-        self, light: SceneLight, materials: Mapping[str, Any] | None, share: Float[np.ndarray, " n"] | None = None
+    def arriving(
+        self,
+        stage: Stage,
+        environment: Environment,
+        direct: Environment | None = None,
+        share: Float[np.ndarray, " n"] | None = None,
     ) -> Arriving:
+        """The light that arrives under an environment, or another one in direct light, and a share of each lamp."""
+        light = self.light(environment)
+        if direct is not None:
+            light = SceneLight(groups.direct(self.surfaces, direct), light.transferred)
+        return self._shade(light, stage, share)
+
+    def _shade(self, light: SceneLight, stage: Stage, share: Float[np.ndarray, " n"] | None = None) -> Arriving:
         """`shade` with a share of the radiance of each lamp; all of it if None."""
         require.kind("the light", light, SceneLight, source="RelitScene.light")
-        of_parts, changed = scene_lamps.split(self.lamps, materials)
-        appearances = self.appearances(of_parts)
-        blends = [look.blend for look in self._gathered(appearances)]
-        pairs = zip(self.surfaces, light.direct, blends, strict=True)
-        direct = tuple(surface.system.shade(lit, blend) for surface, lit, blend in pairs)
-        if self.table.frame is not None:
+        rows = zip(self.surfaces, light.direct, stage.blends, strict=True)
+        direct = [surface.system.shade(lit, blend) for surface, lit, blend in rows]
+        if stage.table.frame is not None:
             pairs = zip(self.surfaces, direct, strict=True)
-            direct = tuple(surface.system.tilted(lit, surface.frame[:, 2]) for surface, lit in pairs)
-        lamp = None if self.lamps is None else self.lamps.radiance(self._all(appearances), changed)
+            direct = [surface.system.tilted(lit, surface.frame[:, 2]) for surface, lit in pairs]
+        lamp = stage.radiance
         lamp = lamp if lamp is None or share is None else lamp * share[:, None].astype(lamp.dtype)
-        reflected = None if self.bounces is None else self.bounces.shade(light.transferred, blends, lamp)
-        return Arriving(direct, reflected, lamp)
+        reflected = None if self.bounces is None else self.bounces.shade(light.transferred, stage.blends, lamp)
+        return Arriving(tuple(direct), reflected, lamp)
 
     @promoted
     def view(
         self,
         eye: Float[Array | np.ndarray, "3"],
-        materials: Mapping[str, Any] | None = None,
+        materials: Mapping[str, Any] | Stage | None = None,
         points: Points | Sequence[Points] = VERTICES,
     ) -> SceneView:
         """The factor of radiance that depends on the eye and the materials, for all groups.
@@ -251,18 +268,18 @@ class RelitScene(System):
         """
         groups.check_points(points, self.scene.counts)
         eye = require.position("the eye", origins.local("the eye", eye, self.mesh.origin))
-        of_parts = scene_lamps.split(self.lamps, materials)[0]
-        appearances = self.appearances(of_parts)
-        stage, looks = self._stage(of_parts, appearances), self._gathered(appearances)
-        views, starts = [], []
-        for group, (surface, look) in enumerate(zip(stage.surfaces, looks, strict=True)):
-            in_scene, on_group = self._points(group, stage, points)
+        stage, views, starts = self._stage(materials), [], []
+        for group, look in enumerate(stage.appearance):
+            surface, (in_scene, on_group) = groups.surface_of(stage, group), self.layout.points(group, points)
+            if stage.table.frame is not None:
+                on_group = on_group.tilted(stage.table.at(in_scene).normal)
             blend, emitted = jax.tree.map(on_group.carry, (look.blend, look.emitted))
             sharp = stage.sharp_at(group, in_scene)
             if sharp is not None:
                 if on_group.all_vertices:
                     with compile_time(self.mesh, eye):
-                        sharp = sharp * tracing.facing(self.mesh, eye)[in_scene.corner[0]] * self._real(group)
+                        real = np.arange(len(sharp)) < sum(self.layout.of_group(group, self.layout.counts))
+                        sharp = sharp * tracing.facing(self.mesh, eye)[in_scene.corner[0]] * real.astype(sharp.dtype)
                 starts.append(tracing.RayOrigins(group, in_scene, on_group, blend, sharp))
             views.append(Viewed(on_group, view_of(surface, eye, blend, on_group, sharp), emitted))
         reflected = tracing.trace(stage, starts, eye, keep=True) if starts else None
@@ -290,115 +307,44 @@ class RelitScene(System):
         self, lights: Float[Array, "l 6 n n c"], view: SceneView, materials: Any = None, points: Any = VERTICES
     ) -> Float[Array, "l p _"]:
         """Radiance under several lights, by one program for each group: `System.under_lights`."""
+        stage = self._stage(materials)
         if view.reflected is not None:  # Rays hit other numbers of points from each eye.
-            arriving = (protocol.arriving(self, Environment(light), materials) for light in lights)
+            arriving = (self.arriving(stage, Environment(light)) for light in lights)
             return jnp.stack([self.combine(light, view, points) for light in arriving])
-        of_parts, changed = scene_lamps.split(self.lamps, materials)
-        appearances = self.appearances(of_parts)
-        blends = [look.blend for look in self._gathered(appearances)]
-        lamp = None if self.lamps is None else self.lamps.radiance(self._all(appearances), changed)
-        return batches.radiance(self.surfaces, self.bounces, lights, blends, lamp, view, self.layout.order(points))
+        return batches.radiance(stage, self.bounces, lights, view, self.layout.order(points))
 
-    def _points(self, group: int, stage: Stage, points: Points | Sequence[Points]) -> tuple[Points, Points]:
-        """Points, with the normals of normal maps, as points of the scene and of a group."""
-        in_scene, on_group = self.layout.points(group, points)
-        if stage.table.frame is None:
-            return in_scene, on_group
-        return in_scene, on_group.tilted(groups.look_at(stage.table, stage.rough, in_scene).normal)
-
-    def _real(self, group: int) -> Float[np.ndarray, " v"]:
-        """1 at vertices of a group, 0 in padding."""
-        count = sum(self.layout.of_group(group, self.layout.counts))
-        return (np.arange(self.layout.size[group]) < count).astype(self.mesh.position.dtype)
-
-    def _gathered(self, appearances: Mapping[str, Appearance]) -> list[Appearance]:
-        """The appearance of each group: the precomputed one, or with other materials of some parts."""
-        if not appearances:
-            return list(self.appearance)
-        looks, changed = self._all(appearances), [name in appearances for name in self.scene.names]
-        return [
-            self.layout.gathered(group, looks) if any(self.layout.of_group(group, changed)) else look
-            for group, look in enumerate(self.appearance)
-        ]
-
-    def _stage(self, materials: Mapping[str, Any] | None, appearances: Mapping[str, Appearance]) -> Stage:
-        """The scene with given materials, as pictures and reflections take it."""
-        of_parts, names = dict(materials or {}), self.scene.names
-        new = {name: material for name, material in of_parts.items() if channels.is_model(material)}
-        table, rough = self._tables(new)
-        fixed = [name in of_parts and name not in new for name in names]
-        unchanged = Appearance(None)
-        changed = [appearances.get(name, unchanged) for name in names]
-        at_vertices = [self._vertex_materials(group, fixed, changed) for group in range(len(self.surfaces))]
-        bend, samples, sharp = self._traits(changed)
-        surfaces = [self._surface(group, sharp) for group in range(len(self.surfaces))]
-        emitting = {} if self.lamps is None else {part: lamp for lamp, part in enumerate(self.lamps.emitting)}
-        lamp = tuple(emitting.get(part, -1) for part in range(len(names)))
-        bends = groups.spread(bend, self.layout.counts, len(self.drawn.position), self.mesh.position.dtype)
-        return Stage(
-            self.mesh,
-            self.drawn,
-            tuple(surfaces),
-            table,
-            rough,
-            tuple(at_vertices),
-            bends,
-            self.layout,
-            samples,
-            sharp,
-            lamp,
-            tuple(sides.hidden_backs(self.scene).tolist()),
-            *(((), None) if self.lamps is None else self.lamps.sources(self._all({}), self.mesh.origin)),
+    def _stage(self, materials: Mapping[str, Any] | Stage | None) -> Stage:
+        """The scene with given materials, which all methods read."""
+        if isinstance(materials, Stage):
+            return materials
+        of_parts, lights = scene_lamps.split(self.lamps, materials)
+        table, new = self._evaluated(of_parts)
+        if not new and not lights:
+            return self.stage
+        stage, names, layout = self.stage, self.scene.names, self.layout
+        looks = [new.get(name) or shading.appearance for name, shading in zip(names, self.shading, strict=True)]
+        changed = [name in new for name in names]
+        traits = list(zip(stage.curvature, stage.samples, stage.sharp, strict=True))
+        for part, shading in enumerate(self.shading):
+            if changed[part] and shading.table is not None and known(looks[part]):
+                shading = dataclasses.replace(shading, blend=looks[part].blend)
+                traits[part] = reflection.traits(shading, stage.surfaces[layout.group[part]])
+        curvature, samples, sharp = zip(*traits, strict=True)
+        appearance = tuple(
+            put(layout.gathered(group, looks)) if any(layout.of_group(group, changed)) else look
+            for group, look in enumerate(stage.appearance)
         )
-
-    def _tables(self, new: Mapping[str, Any]) -> tuple[MaterialTable, MaterialTable | None]:
-        """The materials of all parts with some new ones; and their roughness alone, if JAX traces only the rest."""
-        if not new:
-            return self.table, None
-        before = [part.material for part in self.scene.parts]
-        after = [new.get(part.name, part.material) for part in self.scene.parts]
-        table = put(material_table.with_materials(self.table, after, before))
-        if known(table):
-            return table, None
-        with compile_time():
-            plain = [channels.rough(material) for material in after]
-            if not known(plain, self.table):
-                return table, None
-            return table, put(material_table.with_materials(self.table, plain, before))
-
-    def _traits(self, appearances: Sequence[Appearance]) -> tuple[list, tuple[int, ...], tuple[bool, ...]]:
-        """Curvature of each part's radiance, samples of bright texels, and whether its reflections are traced."""
-        rows = list(zip(self.curvature, self.samples, self.sharp, strict=True))
-        for part, (look, shading) in enumerate(zip(appearances, self.shading, strict=True)):
-            if look.blend is not None and shading.table is not None and known(look):
-                group = self.layout.group[part]
-                new = dataclasses.replace(shading, blend=look.blend)
-                rows[part] = reflection.traits(new, self.surfaces[group])
-        bend, samples, sharp = zip(*rows, strict=True)
-        return list(bend), samples, sharp
-
-    def _surface(self, group: int, sharp: Sequence[bool]) -> Surface:
-        """A group, with rays for its reflections if any of its parts is sharp."""
-        surface = self.surfaces[group]
-        if surface.reflecting is None or not self.rays or not any(self.layout.of_group(group, sharp)):
-            return surface.without_rays
-        return dataclasses.replace(surface, reflecting=dataclasses.replace(surface.reflecting, count=self.rays))
-
-    def _vertex_materials(
-        self, group: int, fixed: Sequence[bool], appearances: Sequence[Appearance]
-    ) -> VertexMaterials | None:
-        """Materials that users give at the vertices of some parts of a group; None without."""
-        flags, counts = (self.layout.of_group(group, values) for values in (fixed, self.layout.counts))
-        if not any(flags) or self.surfaces[group].scale is None:
-            return None
-        rows = zip(appearances, fixed, self.shading, strict=True)
-        whole = self.layout.gathered(
-            group, [look if flag else channels.precomputed(shading) for look, flag, shading in rows]
+        chosen = [name in new and not isinstance(of_parts[name], Changeable) for name in names]
+        return dataclasses.replace(
+            stage,
+            table=table,
+            appearance=appearance,
+            fixed=tuple(layout.fixed(group, look, chosen) for group, look in enumerate(appearance)),
+            curvature=(np if known(curvature) else jnp).asarray(curvature, stage.curvature.dtype),
+            samples=samples,
+            sharp=sharp,
+            radiance=None if self.lamps is None else self.lamps.radiance(looks, lights),
         )
-        dtype = self.mesh.position.dtype
-        flag = self.layout.column(group, [np.full(*row, dtype) for row in zip(counts, flags, strict=True)])
-        emitted = np.zeros((self.layout.size[group], 3), dtype) if whole.emitted is None else whole.emitted
-        return None if whole.blend is None else put(VertexMaterials(whole.blend, emitted, flag))
 
     @promoted
     def radiance(
@@ -412,8 +358,8 @@ class RelitScene(System):
         """Radiance that each vertex or point sends to the eye, including emission; see `jaxprt.radiance`."""
         environment = protocol.light_for(self, environment, batch=True)
         of_parts, changed = scene_lamps.split(self.lamps, materials)
-        looks = {**self.appearances(of_parts), **changed}
-        return protocol.radiance(self, environment, eye=eye, materials=looks, points=points)
+        stage = self._stage({**self.appearances(of_parts), **changed})
+        return protocol.radiance(self, environment, eye=eye, materials=stage, points=points)
 
     @property
     def origin(self) -> origins.Origin:
@@ -429,7 +375,7 @@ class RelitScene(System):
         if origin == origins.ZERO:
             return self
         moved = scenes.centered(self.scene), meshes.centered(self.mesh), self.camera.local(origin)
-        result = eqx.tree_at(lambda relit: (relit.scene, relit.mesh, relit.camera), self, moved)
+        result = eqx.tree_at(lambda relit: (relit.scene, relit.stage.whole, relit.camera), self, moved)
         if self.lamps is None:
             return result
         return eqx.tree_at(lambda relit: relit.lamps.point_lights, result, result.scene.point_lights)
@@ -547,7 +493,7 @@ class RelitScene(System):
         lights = batches.of_one_size(environments, self.light_size)
         pictures.check(self, lights, shadows=shadows)
         options = {"samples": samples, "keep": False, "shadow": shadows, "between": None}
-        view_of = partial(self._picture_view, materials=materials, **options)
+        view_of = partial(self._picture_view, materials=self._stage(materials), **options)
         return batches.blocks(view_of, lights, cameras, memory=int(memory), background=background, layers=layers)
 
     @property
@@ -602,7 +548,7 @@ class RelitScene(System):
         hidden = groups.faces_of(self.mesh, np.repeat(backs, self.layout.counts)) if backs.any() else None
         occluder = None if self.mesh.opacity is None else caster(self.mesh).occluder
         options = {"samples": samples, "hidden": hidden, "occluder": occluder}
-        cover = pixels.coverage(self.drawn, camera.local(self.mesh.origin), **options)
+        cover = pixels.coverage(self.stage.mesh, camera.local(self.mesh.origin), **options)
         return pictures.folded(cover[..., None], fold=fold)[..., 0]
 
     @promoted
@@ -651,17 +597,12 @@ class RelitScene(System):
         camera = self.camera if camera is None else camera
         require.function("between", options.get("between"))
         require.kind("the camera", camera, Camera, source="jaxprt.scene.camera.orbit")
-        of_parts = scene_lamps.split(self.lamps, materials)[0]
-        appearances = self.appearances(of_parts)
-        stage = self._stage(of_parts, appearances)
-        arriving = pictures.SceneLighting(self, materials, appearances)
-        names = () if self.lamps is None else self.lamps.names(self.scene.names)
-        return pictures.make(stage, arriving, camera.local(self.mesh.origin), lamps=names, **options)
+        return pictures.make(self, self._stage(materials), camera.local(self.mesh.origin), **options)
 
     def with_rays(self, rays: int) -> "RelitScene":
         """The scene with another number of reflection rays for its sharp parts; 0 reflects by harmonics alone."""
-        tracing.check_more_rays(rays, self.rays, self.surfaces)
-        return self._replaced(rays=rays)
+        tracing.check_more_rays(rays, self.stage.rays, self.surfaces)
+        return self._replaced(dataclasses.replace(self.stage, rays=rays))
 
     @promoted
     def report(self, environments: Sequence[Environment] | None = None) -> measuring.Report:
@@ -699,8 +640,12 @@ class RelitScene(System):
             ValueError: For the reasons that `view` gives, or a material emits light on a part that was precomputed
                 without.
         """
+        return self._evaluated(materials)[1]
+
+    def _evaluated(self, materials: Mapping[str, Any] | None) -> tuple[MaterialTable, dict[str, Appearance]]:
+        """The materials of all parts, some of them new, and those of the new ones at their vertices."""
         if materials is None:
-            return {}
+            return self.stage.table, {}
         if not isinstance(materials, Mapping):
             raise TypeError(
                 f"the materials must be a dictionary from names of parts to materials, got {type(materials).__name__}"
@@ -709,10 +654,8 @@ class RelitScene(System):
         unknown = [name for name in materials if name not in names]
         if unknown:
             raise ValueError(f"materials must be for the parts {names}, got one for {unknown[0]!r}")
-        result = {}
-        table, rough = self._tables(
-            {name: material for name, material in materials.items() if channels.is_model(material)}
-        )
+        models = {name: material for name, material in materials.items() if isinstance(material, Changeable)}
+        table, result = self._table(models), {}
         for name, material in materials.items():
             index = names.index(name)
             part, shading = self.scene.parts[index], self.shading[index]
@@ -723,10 +666,10 @@ class RelitScene(System):
                 )
             kinds, source = (*typing.get_args(Changeable), Appearance, Blend), "jaxprt.scene or RelitScene.appearances"
             require.kind(f"the material of part {name!r}", material, *kinds, source=source)
-            if channels.is_model(material):
+            if isinstance(material, Changeable):
                 first = int(self.layout.first[index])
                 vertex = np.arange(first, first + len(part.mesh.position), dtype=np.int32)
-                look = groups.look_at(table, rough, material_table.at_vertices(vertex))
+                look = table.at(material_table.at_vertices(vertex))
                 material = appearance(part, shading, material, look=look)
             else:
                 material = self._divided(index, material)
@@ -737,7 +680,19 @@ class RelitScene(System):
                     f"part {name!r} was precomputed without emission, so light that it emits would not reach other "
                     "parts: precompute the scene with a material that emits"
                 )
-        return result
+        return table, result
+
+    def _table(self, new: Mapping[str, Any]) -> MaterialTable:
+        """The materials of all parts with new ones; also their roughness alone, if JAX traces only the rest."""
+        before, old = [part.material for part in self.scene.parts], self.stage.table
+        after = [new.get(part.name, part.material) for part in self.scene.parts]
+        table = put(material_table.with_materials(old, after, before)) if new else old
+        if known(table):
+            return table
+        with compile_time():
+            plain = [channels.rough(material) for material in after]
+            rough = put(material_table.with_materials(old, plain, before)) if known(plain, old) else None
+        return dataclasses.replace(table, rough=rough)
 
     @property
     def vertices(self) -> int:
@@ -761,8 +716,3 @@ class RelitScene(System):
             raise ValueError(f"part must be the index of one of {len(self.shading)} parts, got {part!r}")
         first = int(self.layout.start[part])
         return axes.take(self.surfaces[self.layout.group[part]].system, slice(first, first + self.layout.counts[part]))
-
-    def _all(self, appearances: Mapping[str, Appearance]) -> list[Appearance]:
-        """The appearance of each part: the given one, or that of the material it was precomputed with."""
-        pairs = zip(self.scene.parts, self.shading, strict=True)
-        return [appearances.get(part.name) or channels.precomputed(shading) for part, shading in pairs]

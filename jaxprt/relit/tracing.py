@@ -25,7 +25,7 @@ from jaxprt import require
 from jaxprt.compile import jit, known, put
 from jaxprt.relit import canvas
 from jaxprt.relit.casting import Caster, caster
-from jaxprt.relit.groups import Arriving, Stage, Surface, look_at
+from jaxprt.relit.groups import Arriving, Stage, Surface, surface_of
 from jaxprt.relit.surface import Viewed, radiance, view
 from jaxprt.scene import Mesh
 from jaxprt.scene.points import Points
@@ -123,9 +123,9 @@ class Reflections(eqx.Module):
 
 def _viewed(stage: Stage, row: HitRow) -> Viewed:
     """What does not depend on the light, at the hits of a row."""
-    look = look_at(stage.table, stage.rough, row.points)
+    surface, look = stage.surfaces[row.group].without_rays, stage.table.at(row.points)
     options = {"fixed": stage.fixed[row.group], "variance": row.variance, "glows": False}
-    return view(stage.surfaces[row.group].without_rays, row.on_group, look, row.eye, **options)
+    return view(surface, row.on_group, look, row.eye, **options)
 
 
 def trace(stage: Stage, origins: Sequence[RayOrigins], eye: Float[Array, "3"], *, keep: bool) -> Reflections:
@@ -160,7 +160,7 @@ def trace(stage: Stage, origins: Sequence[RayOrigins], eye: Float[Array, "3"], *
 
 def _reflecting(stage: Stage, origin: RayOrigins) -> ReflectingPart:
     """How the group of some origins reflects."""
-    reflecting = stage.surfaces[origin.group].reflecting
+    reflecting = surface_of(stage, origin.group).reflecting
     return require.kind("what reflects", reflecting, ReflectingPart, source="a precomputation with bounces")
 
 

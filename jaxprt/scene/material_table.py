@@ -4,6 +4,7 @@ The texels of all textures stand in one array. Which image a part reads, and how
 program depends on the number of points only, and not on the parts or their textures.
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxprt.brdf import BlinnPhong, CookTorrance, MetallicRoughness, sheen
-from jaxprt.compile import kept, known, put, shared_size
+from jaxprt.compile import compile_time, kept, known, put, shared_size
 from jaxprt.scene import texture
 from jaxprt.scene.material import Texture, TexturedMaterial
 from jaxprt.scene.points import Points
@@ -158,6 +159,7 @@ class MaterialTable(eqx.Module):
         color: Color of each vertex, which multiplies the base color.
         frame: Normal, tangent and handedness of each vertex; None in scenes without normal maps.
         normal_scale: Factor of the slopes of each material's normal map; None in scenes without.
+        rough: Materials of the same roughness, which is known, where JAX traces other parameters; else None.
     """
 
     factor: Float[Array | np.ndarray, "m f"]
@@ -171,6 +173,7 @@ class MaterialTable(eqx.Module):
     color: Float[Array | np.ndarray, "v 3"]
     frame: Float[Array | np.ndarray, "v 7"] | None = None
     normal_scale: Float[Array | np.ndarray, " m"] | None = None
+    rough: "MaterialTable | None" = None
 
     @property
     def tilted(self) -> Bool[np.ndarray, " m"]:
@@ -188,15 +191,19 @@ class MaterialTable(eqx.Module):
         Outside of `jax.jit` any number of points runs one program, and the result of other numbers than `ROW` is in
         NumPy.
         """
-        count = len(points)
-        if count == ROW or not count or not known(points) or points.corner.shape[0] != 3:
-            return _evaluate(self, points)
-        index = np.minimum(np.arange(-(-count // ROW) * ROW), count - 1).reshape(-1, ROW)
-        host = jax.tree.map(np.asarray, points)
-        slope = np.zeros((2, *host.weight.shape), host.weight.dtype) if host.slope is None else host.slope
-        rows = [_evaluate(self, put(Points(host.corner[:, n], host.weight[:, n], slope[..., n]))) for n in index]
-        xp = np if known(rows) else jnp
-        return jax.tree.map(lambda *row: xp.concatenate(row)[:count], *rows)
+        if self.rough is not None:
+            look, plain = dataclasses.replace(self, rough=None).at(points), self.rough.at(points)
+            return look._replace(log_roughness=plain.log_roughness, log_layer=plain.log_layer)
+        with compile_time(self, points):
+            count = len(points)
+            if count == ROW or not count or not known(points) or points.corner.shape[0] != 3:
+                return _evaluate(self, points)
+            index = np.minimum(np.arange(-(-count // ROW) * ROW), count - 1).reshape(-1, ROW)
+            host = jax.tree.map(np.asarray, points)
+            slope = np.zeros((2, *host.weight.shape), host.weight.dtype) if host.slope is None else host.slope
+            rows = [_evaluate(self, put(Points(host.corner[:, n], host.weight[:, n], slope[..., n]))) for n in index]
+            xp = np if known(rows) else jnp
+            return jax.tree.map(lambda *row: xp.concatenate(row)[:count], *rows)
 
     def at_vertices(self) -> MaterialLook:
         """The materials at all vertices; in NumPy unless JAX traces the table."""

@@ -90,7 +90,7 @@ class _Views(NamedTuple):
         for number in range(_VIEWS):
             eye = target + stages.about(2 * np.pi * number / _VIEWS) @ (jnp.asarray(scene.camera.eye) - target)
             camera = dataclasses.replace(scene.camera, eye=eye, width=_EDGE, height=_EDGE)
-            shown = nearest_fragments(scene.drawn, camera, hidden=np.asarray(hidden), occluder=occluder)
+            shown = nearest_fragments(scene.stage.mesh, camera, hidden=np.asarray(hidden), occluder=occluder)
             triangle = np.asarray(shown.triangle).reshape(-1)
             pixel = np.flatnonzero(triangle >= 0)
             cameras.append(camera)
@@ -133,7 +133,8 @@ def measure(scene: RelitScene, page: PageScene, lights: Mapping[str, Environment
 def _without_lamps(scene: RelitScene) -> RelitScene:
     """The scene without the light of its lamps. Parts that emit still show their emission."""
     surfaces = tuple(dataclasses.replace(surface, lit=None) for surface in scene.surfaces)
-    return eqx.tree_at(lambda relit: (relit.surfaces, relit.lamps), scene, (surfaces, None))
+    stage = dataclasses.replace(scene.stage, surfaces=surfaces, point_lights=(), power=None, radiance=None)
+    return eqx.tree_at(lambda relit: (relit.stage, relit.lamps), scene, (stage, None))
 
 
 def _relative(off: Float[np.ndarray, "n 3"], whole: Float[np.ndarray, "n 3"]) -> float:

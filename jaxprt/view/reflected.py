@@ -4,7 +4,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxprt.relit.groups import Appearance
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment
 from jaxprt.sphere import cubemap, harmonics
@@ -27,8 +26,7 @@ def transfer(relit: RelitScene) -> list[Float[np.ndarray, "k 3 _"]] | None:
     basis = harmonics.evaluate(cubemap.direction(size=_EDGE), degree=DEGREE)
     count = 0 if relit.bounces is None else ROWS - 1
     rows = [_reflected(relit, Environment(basis[..., k, None]), None) for k in range(count)]
-    looks = [Appearance(shading.blend, shading.emitted) for shading in relit.shading]
-    lamp = None if relit.lamps is None else relit.lamps.radiance(looks, {})
+    lamp = relit.stage.radiance
     last = _reflected(relit, Environment(jnp.zeros_like(basis[..., :1])), lamp)
     if relit.lamps is not None and lamp is not None:
         last = [row + _direct(group, lamp) for row, group in zip(last, relit.lamps.group, strict=True)]
@@ -43,8 +41,7 @@ def _reflected(
     """Irradiance / pi of reflected light at the vertices of each group."""
     if relit.bounces is None:
         return [np.zeros((3, count)) for count in relit.layout.size]
-    blends = [look.blend for look in relit.appearance]
-    arriving = relit.bounces.shade(relit.bounces.light(light), blends, lamp)
+    arriving = relit.bounces.shade(relit.bounces.light(light), relit.stage.blends, lamp)
     factor, zonal = upright_cosine(_ARRIVING), np.arange(_ARRIVING + 1)
     rows = [np.asarray(group, np.float64)[zonal * (zonal + 1)] for group in arriving]
     return [np.broadcast_to(np.einsum("l,lcv->cv", factor, row), (3, row.shape[2])) for row in rows]

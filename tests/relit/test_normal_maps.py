@@ -151,7 +151,7 @@ def test_another_map_is_a_new_material_and_its_scale_has_gradients(close):
 
 def test_a_scene_without_normal_maps_has_none_at_its_points():
     flat = prt.precompute(square(**GLOSSY), system=Lobes(lobes=4, texels=8), size=SIZE, progress=False)
-    assert flat.table.frame is None
+    assert flat.stage.table.frame is None
     view = flat.picture_view(CAMERA, samples=1)
     assert all(row.viewed.points.normal is row.viewed.sight.above is None for row in view.rows)
     with pytest.raises(ValueError, match="normal maps only in scenes that were precomputed with one"):

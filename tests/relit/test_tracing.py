@@ -201,7 +201,7 @@ def test_rough_parts_have_no_rays_and_bad_numbers_of_them_are_refused():
         relit().with_rays(-1)
     assert relit().with_rays(0).view(EYE).reflected is None
     without = relit().with_rays(0)
-    assert without.with_rays(8).rays == 8
+    assert without.with_rays(8).stage.rays == 8
     alone = [surface.without_rays for surface in without.surfaces]
     with pytest.raises(ValueError, match="rays must be 0 for a scene that was precomputed with rays=0, got 8"):
         tracing.check_more_rays(8, 0, alone)
