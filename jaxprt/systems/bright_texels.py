@@ -252,12 +252,12 @@ class Squares(NamedTuple):
 
     Attributes:
         edge: Number along the edge of a face.
-        count: Number of squares.
+        number: How many there are.
         samples: Number of sample points along the edge of each.
     """
 
     edge: int
-    count: int
+    number: int
     samples: int
 
 

@@ -75,6 +75,7 @@ def combine(system: Any, light: PyTree, seen: WidenedView, points: Points) -> Fl
     if not isinstance(light, BrightLight):
         return system.combine(light, seen.rest, points)
     sent, first = system.system.combine(light.rest, seen.rest, points), 0
+    shares: Any = light.seen
     frame = jnp.moveaxis(seen.frame, 0, 2)
     for edge, count, _ in system.squares:
         rows = slice(first, first + count)
@@ -91,6 +92,6 @@ def combine(system: Any, light: PyTree, seen: WidenedView, points: Points) -> Fl
             wi = jnp.sum(frame * direction[:, None], 1).T
             return lobe.evaluate(wi) * jnp.linalg.norm(area) * share * excess[:, None]
 
-        sent = sent + total(lit, (direction, area, light.excess[rows], light.seen[rows])).T
+        sent = sent + total(lit, (direction, area, light.excess[rows], shares[rows])).T
         first += count
     return sent
