@@ -113,6 +113,8 @@ def small(coarse: None, bound) -> Iterator[None]:
             (prt.separable.factor, {"resolution": 8, "terms": 8}),
             (prt.harmonic.tabulate, {"resolution": 8, "error": 1.0}),
             (prt.lobe.tabulate, {"resolution": 8, "lobes": 4}),
+            (prt.dynamic.tabulate, {"resolution": 8}),
+            (prt.dynamic.compress, {"components": 8, "modes": 16, "keep": 64}),
             (prt.scene.mesh.ground_plane, {"vertices": 100}),
             (prt.bounces.precompute, {"edge": 2, "components": 8, "modes": 8}),
         ):

@@ -27,7 +27,6 @@ CELLS = 32, 16, 8  # edges of faces in cells: squares of texels whose mean radia
 _PLANS = ((32, 64), (8, 32)), ((16, 64), (8, 64)), ((8, 64),)
 _JUMP, _WITHIN = 16, 0.1  # edge of the means whose steps lobes cannot follow, and what steps within them count
 _WIDE = 4  # edge of the means about which steps are counted
-_SMOOTH = 2  # sample points along the edge of a texel of the smoothest BRDF for which cells are summed
 FULL = 240  # the share of a texel or cell that is all visible: sixteenths and quarters are whole numbers
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
 _TOGETHER = 32  # texels whose visibility is read at once
@@ -145,9 +144,10 @@ class BrightTexels(VertexSystem):
         """The texels and the cells of each level, in the order of `BrightLight`."""
         size, samples = self.visibility.size, self.samples or 1
         texels = Squares(size, self.count, samples)
-        steps = [int(np.log2(size // edge)) for edge in self.levels]
-        cells = zip(self.levels, cell_counts(self.levels), steps, strict=True)
-        return texels, *(Squares(edge, count, samples + step // 3) for edge, count, step in cells)
+        # Wide lobes need the middle of a cell alone. Materials that become smoother need more places in wide cells.
+        more = {CELLS[-1]: 2 * samples} if samples > 1 else {}
+        cells = zip(self.levels, cell_counts(self.levels), strict=True)
+        return texels, *(Squares(edge, count, more.get(edge, samples)) for edge, count in cells)
 
     def shade(self, light: BrightLight, materials: PyTree = None) -> BrightLight:
         """Light of the rest that arrives at the vertices, and what they see of the bright texels."""
@@ -269,8 +269,8 @@ def _plans(levels: Sequence[int]) -> list[tuple[tuple[int, int], ...]]:
 
 
 def levels_for(samples: int, size: int) -> tuple[int, ...]:
-    """Levels of cells for a BRDF, by its sample points along the edge of a texel; none for very narrow lobes."""
-    return tuple(edge for edge in CELLS if edge < size) if samples <= _SMOOTH else ()
+    """Levels of cells for a BRDF, by its sample points along the edge of a texel: none if its lobes are narrow."""
+    return tuple(edge for edge in CELLS if edge < size) if samples == 1 else ()
 
 
 def cell_counts(levels: Sequence[int]) -> list[int]:
