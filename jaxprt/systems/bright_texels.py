@@ -159,7 +159,8 @@ class BrightTexels(VertexSystem):
             return light
         if self.matte and getattr(self.brdf, "matte", False):
             return dataclasses.replace(light, flux=_vector_flux(self.visibility, light.texel, light.excess))
-        return dataclasses.replace(light, seen=_shares(self.visibility, light.texel, light.excess, self.squares))
+        numbers = tuple((edge, number) for edge, number, _ in self.squares)
+        return dataclasses.replace(light, seen=_shares(self.visibility, light.texel, light.excess, numbers))
 
     def tilted(self, light: BrightLight, normal: Float[Array, "v 3"]) -> BrightLight:
         """The light, whose rest is that of the underlying system: `System.tilted`."""
@@ -550,24 +551,17 @@ def texel_radiance(
         visible = mapped(points.carry, visible)
     # Sample points are processed one by one, so that intermediate arrays stay in the processor's cache. A loop over the
     # points of a texel within one over texels takes three times as long on CPUs.
-    parts, first = [], 0
-    for edge, count, samples in squares:
-        number = np.repeat(np.arange(first, first + count), samples**2)
-        at = slice(first, first + count)
-        parts.append((*_points(texel[at], edge, samples, None if spot is None else spot[at]), number))
-        first += count
-    direction, area, number = zip(*parts, strict=True)
-    rows = (jnp.concatenate([part.reshape(-1, 3) for part in way]).astype(excess.dtype) for way in (direction, area))
-    return total(lit, (*rows, jnp.asarray(np.concatenate(number)))).T
+    direction, area, number = _sample_points(texel, squares, spot)
+    return total(lit, (direction.astype(excess.dtype), area.astype(excess.dtype), number)).T
 
 
-@partial(jit, static_argnames=("squares",))
+@partial(jit, static_argnames=("numbers",))
 def _shares(
-    visibility: Any, texel: Int[Array, " t"], excess: Float[Array, "t c"], squares: tuple[Squares, ...]
+    visibility: Any, texel: Int[Array, " t"], excess: Float[Array, "t c"], numbers: tuple[tuple[int, int], ...]
 ) -> UInt8[Array, "t v"]:
     """Visible share of each of the given texels and cells for every vertex, in 240ths; 0 for those not used."""
     rows, first = [], 0
-    for edge, count, _ in squares:
+    for edge, count in numbers:
         cell, used = texel[first : first + count], jnp.any(excess[first : first + count] != 0)
 
         def seen(cell: Array, edge: int = edge, finest: bool = not first) -> Array:
@@ -639,6 +633,20 @@ def irradiance(transport: Visibility, texel: Int[Array, " t"], excess: Float[Arr
 def _irradiance(transport: Visibility, texel: Array, excess: Array) -> Array:
     flux = _flux(transport.frame[:, 2].T, texel, transport.visible(texel), size=transport.size)
     return (excess.T @ flux).T / np.pi
+
+
+def _sample_points(
+    texel: Int[Array, " t"], squares: Sequence[Squares], spot: Float[Array, "t 4"] | None
+) -> tuple[Array, Array, Array]:
+    """Directions of all sample points, the integral of direction that each stands for, and the number of its texel."""
+    parts, first = [], 0
+    for edge, count, samples in squares:
+        at, number = slice(first, first + count), np.repeat(np.arange(first, first + count), samples**2)
+        parts.append((*_points(texel[at], edge, samples, None if spot is None else spot[at]), number))
+        first += count
+    direction, area, number = zip(*parts, strict=True)
+    way, solid = (jnp.concatenate([part.reshape(-1, 3) for part in rows]) for rows in (direction, area))
+    return way, solid, jnp.asarray(np.concatenate(number))
 
 
 def _points(texel: Int[Array, " t"], size: int, samples: int, spot: Float[Array, "t 4"] | None) -> tuple[Array, Array]:

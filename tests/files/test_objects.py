@@ -70,7 +70,7 @@ def value(hint, random, name=""):
     """Something of a type."""
     arguments = typing.get_args(hint)
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return value(arguments[0], random, name)
+        return None if name == "rough" else value(arguments[0], random, name)  # a table of its own kind
     if typing.get_origin(hint) is tuple:
         each = arguments[:1] * 2 if arguments[-1] is ... else arguments
         return tuple(value(one, random) for one in each)

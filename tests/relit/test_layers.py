@@ -186,7 +186,7 @@ MATERIALS = {
 @functools.cache
 def precomputed(*names: str) -> prt.RelitScene:
     scene = spheres(*(MATERIALS[name] for name in names))
-    return prt.precompute(scene, refine=False, system="lobe", size=16, progress=False)
+    return prt.precompute(scene, refine=False, system=prt.relit.Lobes(12), size=16, progress=False)
 
 
 def test_layers_cost_nothing_where_no_material_has_them():
