@@ -597,7 +597,7 @@ EXAMPLES = {
         )
     ),
     "systems.bright_texels.split": example(lambda draw: call(draw.light()), count=5),
-    "systems.bright_texels.split_cells": example(lambda draw: call(draw.light(16)), levels=(8,), gradient=()),
+    "systems.bright_texels.split_cells": example(lambda draw: call(draw.light(16)), levels=(8,)),
     "systems.bright_texels.brightest": example(
         lambda draw: call(draw.light(), least=draw.array(0.0)), count=5, rank=9, gradient=()
     ),

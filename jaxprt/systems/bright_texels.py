@@ -125,7 +125,7 @@ class BrightTexels(VertexSystem):
 
     def __check_init__(self):
         """Refuses arguments that are not a system or visibility, and visibility of other vertices."""
-        source = "jaxprt.visibility.precompute or jaxprt.lobe.precompute"
+        source = "jaxprt.lobe.precompute" if self.levels else "jaxprt.visibility.precompute or jaxprt.lobe.precompute"
         require.kind("the system", self.system, System, source="jaxprt.lobe.LobeSystem or another system")
         require.kind("the visibility", self.visibility, CellVisibility if self.levels else Visibility, source=source)
         require.length("vertices of the visibility", self.visibility.position, self.system.vertices)
@@ -318,8 +318,8 @@ def split_cells(
 def _largest_cells(light: Array, area: Array, edge: int, count: int) -> tuple[Int[Array, " t"], Float[Array, "t c"]]:
     """The cells with the most flux, and the radiance by which each exceeds the next one."""
     mean = _means(light, area, edge).reshape(6 * edge**2, -1)
-    flux = jax.lax.stop_gradient(jnp.sum(mean, -1)) * jnp.sum(_squares(area, edge), (2, 4)).ravel()
-    cell = jax.lax.top_k(flux, count + 1)[1]
+    flux = jnp.sum(mean, -1) * jnp.sum(_squares(area, edge), (2, 4)).ravel()
+    cell = jax.lax.top_k(jax.lax.stop_gradient(flux), count + 1)[1]
     bright = flux[cell]
     fraction = jnp.maximum(1 - jnp.maximum(bright[-1], 0) / jnp.where(bright[:-1] > 0, bright[:-1], 1), 0)
     fraction = jnp.where(bright[:-1] > 0, fraction, 0).astype(light.dtype)
@@ -562,14 +562,15 @@ def _shares(
     """Visible share of each of the given texels and cells for every vertex, in 240ths; 0 for those not used."""
     rows, first = [], 0
     for edge, count in numbers:
-        cell, used = texel[first : first + count], jnp.any(excess[first : first + count] != 0)
+        at, whole = slice(first, first + count), edge == visibility.size
 
-        def seen(cell: Array, edge: int = edge, finest: bool = not first) -> Array:
-            share = visibility.visible(cell) if finest else visibility.cells(cell, edge=edge)
+        def seen(cell: Array, edge: int = edge, whole: bool = whole) -> Array:
+            share = visibility.visible(cell) if whole else visibility.cells(cell, edge=edge)
             return jnp.round(share * FULL).astype(jnp.uint8)
 
         none = jnp.zeros((count, len(visibility.position)), jnp.uint8)
-        rows.append(seen(cell) if not first else jax.lax.cond(used, seen, lambda _, none=none: none, cell))
+        used = jnp.any(excess[at] != 0)
+        rows.append(seen(texel[at]) if whole else jax.lax.cond(used, seen, lambda _, none=none: none, texel[at]))
         first += count
     return jnp.concatenate(rows)
 
