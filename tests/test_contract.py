@@ -73,8 +73,7 @@ REASONS = {
         inverse scene.texture.unit_normals scene.sides image.pixels.sky image.pixels.pixel_angle systems.axes
         systems.ranges systems.lobe.system.matte_transport systems.lobe.pyramid.compress systems.lobe.pyramid.dither
         systems.lamps.places systems.bounces.traced.is_sharp systems.bounces.traced.is_traced visibility.members.cluster
-        visibility.members.coordinates systems.bright_texels.samples_for systems.bright_texels.levels_for
-        systems.bright_texels.cell_counts decompose.clustering
+        visibility.members.coordinates systems.bright_texels.samples_for decompose.clustering
         decompose.eigen.orientation decompose.tucker.orient systems.separable.factorization.mark_of
         systems.dynamic.reflected.stacked systems.bounces.gather.shares systems.bounces.gather.cosines
         systems.bounces.gather.measures systems.bounces.patches.divide brdf.places.columns scene.origin
@@ -597,7 +596,7 @@ EXAMPLES = {
         )
     ),
     "systems.bright_texels.split": example(lambda draw: call(draw.light()), count=5),
-    "systems.bright_texels.split_cells": example(lambda draw: call(draw.light(16)), levels=(8,)),
+    "systems.bright_texels.split_cells": example(lambda draw: call(draw.light(16))),
     "systems.bright_texels.brightest": example(
         lambda draw: call(draw.light(), least=draw.array(0.0)), count=5, rank=9, gradient=()
     ),

@@ -134,7 +134,7 @@ class Recipe(eqx.Module):
 
 
 class Lobes(Recipe):
-    """Recipe of the lobe system. The brightest texels of the light are summed exactly.
+    """Recipe of the lobe system. The brightest texels of the light are summed exactly, and cells for rough parts.
 
     Attributes:
         lobes: Number of lobes of the BRDF.
@@ -429,8 +429,8 @@ def _bright(system: System, visible: Any, shading: Shading, texels: int, size: i
     if not texels:
         return system
     samples = samples_of(shading, size)
-    levels = bright_texels.levels_for(samples, size) if cells else ()
-    return bright_texels.BrightTexels(system, visible, shading.brdf, count=texels, samples=samples, levels=levels)
+    wide = cells and samples == 1  # narrower lobes read light and visibility within a cell
+    return bright_texels.BrightTexels(system, visible, shading.brdf, count=texels, samples=samples, cells=wide)
 
 
 def samples_of(shading: Shading, size: int) -> int:

@@ -1,4 +1,12 @@
-"""Exact light from the brightest texels of an environment: stored visibility times the BRDF itself."""
+"""Light from the brightest texels and cells of an environment: stored visibility times the BRDF itself.
+
+A lobe that is half hidden reads the mean of the light times the mean of what is visible, which is wrong where the light
+varies within the lobe. Cells are squares of texels whose mean radiance is taken out of the light, from fine to coarse:
+
+    L = rest + sum_j excess_j box_j        radiance = lobes(rest) + sum_j excess_j v_j f(wi_j, wo) ∫_cell j wi · n dwi
+
+where box_j is 1 in cell j and 0 elsewhere, v_j is the visible share of the cell, and wi_j its middle.
+"""
 
 import dataclasses
 import itertools
@@ -22,11 +30,11 @@ from jaxprt.systems import adaptive, protocol
 from jaxprt.systems.protocol import Blend, System, VertexSystem
 
 _ROW = 32  # texels per row, of which only the brightest is sorted at first
-CELLS = 32, 16, 8  # edges of faces in cells: squares of texels whose mean radiance is taken out
-# Edges and numbers of cells that are taken out together, from fine to coarse. The light chooses one of them.
-_PLANS = ((32, 64), (8, 32)), ((16, 64), (8, 64)), ((8, 64),)
+# Numbers of cells that are taken out together, by the edge of a face in cells. The light chooses one of them.
+_PLANS = {32: 64, 8: 32}, {16: 64, 8: 64}, {8: 64}
 _JUMP, _WITHIN = 16, 0.1  # edge of the means whose steps lobes cannot follow, and what steps within them count
 _WIDE = 4  # edge of the means about which steps are counted
+_WIDEST = 8  # edge of a face in the largest cells
 FULL = 240  # the share of a texel or cell that is all visible: sixteenths and quarters are whole numbers
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
 _TOGETHER = 32  # texels whose visibility is read at once
@@ -113,7 +121,8 @@ class BrightTexels(VertexSystem):
         count: Number of texels that are summed exactly.
         samples: Number of sample points along the edge of each texel, from `samples_for`; None for its center, whatever
             the material.
-        levels: Edges of faces in cells of which some are summed too, from fine to coarse; () for texels alone.
+        cells: Whether cells of the light are summed too, for BRDFs with lobes wider than these. The visibility must
+            have their shares, as that of `jaxprt.lobe.precompute` does.
     """
 
     system: System
@@ -121,21 +130,21 @@ class BrightTexels(VertexSystem):
     brdf: Callable
     count: int = eqx.field(static=True, default=16)
     samples: int | None = eqx.field(static=True, default=1)
-    levels: tuple[int, ...] = eqx.field(static=True, default=())
+    cells: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
         """Refuses arguments that are not a system or visibility, and visibility of other vertices."""
-        source = "jaxprt.lobe.precompute" if self.levels else "jaxprt.visibility.precompute or jaxprt.lobe.precompute"
+        source = "jaxprt.lobe.precompute" if self.cells else "precompute of jaxprt.visibility or jaxprt.lobe"
         require.kind("the system", self.system, System, source="jaxprt.lobe.LobeSystem or another system")
-        require.kind("the visibility", self.visibility, CellVisibility if self.levels else Visibility, source=source)
+        require.kind("the visibility", self.visibility, CellVisibility if self.cells else Visibility, source=source)
         require.length("vertices of the visibility", self.visibility.position, self.system.vertices)
 
     def light(self, environment: Environment) -> BrightLight:
         """Splits the light into its brightest texels and the rest, which the underlying system converts."""
         environment = protocol.light_for(self, environment)
         texel, excess, rest = split(environment, count=self.count)
-        if self.levels:
-            cell, taken, rest = split_cells(rest, levels=self.levels)
+        if self.cells:
+            cell, taken, rest = split_cells(rest)
             texel, excess = jnp.concatenate([texel, cell]), jnp.concatenate([excess, taken])
         return BrightLight(self.system.light(rest), texel, excess)
 
@@ -144,10 +153,12 @@ class BrightTexels(VertexSystem):
         """The texels and the cells of each level, in the order of `BrightLight`."""
         size, samples = self.visibility.size, self.samples or 1
         texels = Squares(size, self.count, samples)
+        if not self.cells:
+            return (texels,)
         # Wide lobes need the middle of a cell alone. Materials that become smoother need more places in wide cells.
-        more = {CELLS[-1]: 2 * samples} if samples > 1 else {}
-        cells = zip(self.levels, cell_counts(self.levels), strict=True)
-        return texels, *(Squares(edge, count, more.get(edge, samples)) for edge, count in cells)
+        wide = samples if samples == 1 else 2 * samples
+        counts = _cell_counts(size).items()
+        return texels, *(Squares(edge, count, wide if edge == _WIDEST else samples) for edge, count in counts)
 
     def shade(self, light: BrightLight, materials: PyTree = None) -> BrightLight:
         """Light of the rest that arrives at the vertices, and what they see of the bright texels."""
@@ -243,9 +254,9 @@ class BrightTexels(VertexSystem):
 
     @property
     def shared_light(self) -> tuple | None:
-        """Key of the light: that of the underlying system, with the number of texels and the levels of cells."""
+        """Key of the light: that of the underlying system, with the number of texels and whether there are cells."""
         rest = self.system.shared_light
-        return rest and (BrightTexels, self.count, self.levels, rest)
+        return rest and (BrightTexels, self.count, self.cells, rest)
 
 
 class Squares(NamedTuple):
@@ -262,54 +273,56 @@ class Squares(NamedTuple):
     samples: int
 
 
-def _plans(levels: Sequence[int]) -> list[tuple[tuple[int, int], ...]]:
-    """The plans whose cells are all of some levels."""
-    plans = [plan for plan in _PLANS if all(edge in levels for edge, _ in plan)]
-    longest = max((len(plan) for plan in plans), default=0)
-    return [plan for plan in plans if len(plan) == longest]
+def _plans(size: int) -> list[dict[int, int]]:
+    """The numbers of cells that can be taken out of a light: all cells are larger than its texels."""
+    return [plan for plan in _PLANS if max(plan) < size]
 
 
-def levels_for(samples: int, size: int) -> tuple[int, ...]:
-    """Levels of cells for a BRDF, by its sample points along the edge of a texel: none if its lobes are narrow."""
-    return tuple(edge for edge in CELLS if edge < size) if samples == 1 else ()
+def _cell_counts(size: int) -> dict[int, int]:
+    """Most cells that a plan takes out, by the edge of a face in cells, from fine to coarse."""
+    most: dict[int, int] = {}
+    for plan in _plans(size):
+        most |= {edge: max(count, most.get(edge, 0)) for edge, count in plan.items()}
+    return dict(sorted(most.items(), reverse=True))
 
 
-def cell_counts(levels: Sequence[int]) -> list[int]:
-    """Number of cells of each level that some plan takes out."""
-    plans = _plans(levels)
-    return [max(dict(plan).get(edge, 0) for plan in plans) for edge in levels]
+@require.arguments(light=protocol.one_light)
+@jit
+def split_cells(light: Environment) -> tuple[Int[Array, " t"], Float[Array, "t c"], Environment]:
+    """Takes radiance out of cells of a light: squares of texels, 6 x 32 x 32, 6 x 16 x 16 and 6 x 8 x 8 of them.
 
-
-@partial(jit, static_argnames=("levels",))
-def split_cells(
-    light: Environment, *, levels: tuple[int, ...]
-) -> tuple[Int[Array, " t"], Float[Array, "t c"], Environment]:
-    """Takes radiance out of cells of a light: squares of texels in which a lobe that is half hidden cannot be read.
-
-    The light chooses how many cells of each level are taken out: those that leave the least steps between means over
-    cells of 6 x 16 x 16.
+    From fine to coarse, the cells with the most flux lose what exceeds the next one. The light chooses how many of each
+    size: those that leave it the most even. Derivatives are those of the chosen cells.
 
     Args:
-        light: One environment.
-        levels: Edges of faces in cells, from fine to coarse, each of which divides that of the faces in texels.
+        light: One environment, whose faces have an edge of a power of two texels. Cells are larger than texels.
 
     Returns:
-        Indices of cells, level after level, with zeros for those that are not used; the radiance taken out of each; and
-        the rest of the environment.
+        Indices of cells, size after size; the radiance taken out of each, 0 for cells that are not used; and the rest
+        of the environment, which may be negative in parts of a cell.
+
+    Raises:
+        TypeError: The light is not an `Environment`.
+        ValueError: The light is a batch, or the edge of its faces is not a power of two.
     """
-    (size, colors), counts = light.radiance.shape[-2:], cell_counts(levels)
+    if (size := light.radiance.shape[-2]) & (size - 1):
+        raise ValueError(f"the light must have faces of a power of two texels along an edge, got {size}")
+    colors, counts = light.radiance.shape[-1], _cell_counts(size)
+    if not counts:
+        return jnp.zeros(0, jnp.int32), jnp.zeros((0, colors), light.radiance.dtype), light
     area, results, steps = cubemap.solid_angle(size=size)[..., None], [], []
-    for plan in _plans(levels):
+    largest = jnp.maximum(jnp.max(light.radiance), jnp.finfo(light.radiance.dtype).tiny)  # squares would overflow
+    for plan in _plans(size):
         rest, cells, taken = light.radiance, [], []
-        for edge, most in zip(levels, counts, strict=True):
-            count = dict(plan).get(edge, 0)
+        for edge, most in counts.items():
+            count = plan.get(edge, 0)
             cell, excess = _largest_cells(rest, area, edge, count)
             full = jnp.zeros((6 * edge**2, colors), rest.dtype).at[cell].set(excess)
             rest = rest - _repeated(full.reshape(6, edge, edge, colors), size)
             cells.append(jnp.pad(cell, (0, most - count)))
             taken.append(jnp.pad(excess, ((0, most - count), (0, 0))))
         results.append((jnp.concatenate(cells), jnp.concatenate(taken), rest))
-        steps.append(_steps(jnp.sum(rest, -1, keepdims=True), area))
+        steps.append(_steps(jnp.sum(rest / largest, -1, keepdims=True), area))
     best = jnp.argmin(jax.lax.stop_gradient(jnp.stack(steps)))
     cell, excess, rest = (jnp.stack(rows)[best] for rows in zip(*results, strict=True))
     return cell, excess, Environment(rest)
@@ -344,8 +357,8 @@ def _repeated(value: Float[Array, "6 e e c"], size: int) -> Float[Array, "6 n n 
 
 
 def _steps(light: Float[Array, "6 n n 1"], area: Array) -> Array:
-    """How much a light varies between cells, as far as lobes cannot follow it, relative to its largest radiance."""
-    size, light = light.shape[1], light / jnp.maximum(jnp.max(jnp.abs(light)), jnp.finfo(light.dtype).tiny)
+    """How much a light varies between cells, as far as lobes cannot follow it."""
+    size = light.shape[1]
     fine = _repeated(_means(light, area, min(_JUMP, size)), size)
     wide = _repeated(_means(light, area, _WIDE), size)
     return jnp.sqrt(jnp.sum(area * ((fine - wide) ** 2 + (_WITHIN * (light - fine)) ** 2)))

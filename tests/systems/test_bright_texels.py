@@ -283,12 +283,12 @@ def soft(size=32):
 
 @pytest.mark.parametrize("strength", [1e-20, 1.0, 1e28])
 def test_cells_and_rest_are_the_light_and_leave_it_even(strength):
-    levels, size = (16, 8), 32
+    size = 32
     light = Environment(strength * soft(size).radiance)
-    cell, excess, rest = bright_texels.split_cells(light, levels=levels)
+    cell, excess, rest = bright_texels.split_cells(light)
     left, first = np.asarray(light.radiance, np.float64), 0
     area = np.asarray(cubemap.solid_angle(size=size), np.float64)[..., None]
-    for edge, count in zip(levels, bright_texels.cell_counts(levels), strict=True):
+    for edge, count in ((16, 64), (8, 64)):
         rows, fold = slice(first, first + count), size // edge
         taken, cells = np.asarray(excess, np.float64)[rows], np.asarray(cell)[rows]
 
@@ -312,7 +312,7 @@ def test_cells_and_rest_are_the_light_and_leave_it_even(strength):
 
 
 def test_a_black_light_has_no_cells_and_stays_black():
-    _, excess, rest = bright_texels.split_cells(Environment(jnp.zeros((6, 32, 32, 3))), levels=(16, 8))
+    _, excess, rest = bright_texels.split_cells(Environment(jnp.zeros((6, 32, 32, 3))))
     assert not np.any(np.asarray(excess))
     assert not np.any(np.asarray(rest.radiance))
 
@@ -324,10 +324,44 @@ def test_soft_boxes_half_hidden_from_glossy_surfaces_are_right_by_cells(mesh):
     rest = lobe.LobeSystem(lobe.compress(seen), lobe.tabulate(brdf, lobes=4))
     expected = np.asarray(exact(seen, brdf, light))
     off = []
-    for levels in ((), (16, 8)):
-        system = bright_texels.BrightTexels(rest, rest.transport, brdf, count=8, samples=1, levels=levels)
+    for cells in (False, True):
+        system = bright_texels.BrightTexels(rest, rest.transport, brdf, count=8, samples=1, cells=cells)
         off.append(
             np.linalg.norm(np.asarray(jaxprt.radiance(system, light, eye=EYE)) - expected) / np.linalg.norm(expected)
         )
     assert off[1] < 0.4 * off[0]
     assert off[1] < 0.03
+
+
+def test_the_light_chooses_small_cells_for_small_boxes_and_medium_ones_for_a_sky():
+    """Of the places for cells of 6 x 32 x 32, 16 x 16 and 8 x 8 those of one size stay empty."""
+    boxes = np.full((6, 64, 64, 3), 0.01, np.float32)
+    boxes[2, 20:28, 30:36] = boxes[4, 40:44, 10:20] = 10.0
+    x, y = np.meshgrid(np.linspace(-1, 1, 64), np.linspace(-1, 1, 64))
+    sky = 1 + np.exp(-4 * (x**2 + (y - 0.3) ** 2))[None, ..., None] * np.array([0, 0, 3, 0, 2, 1]).reshape(6, 1, 1, 1)
+    used = []
+    for light in (boxes, np.broadcast_to(sky, boxes.shape).astype(np.float32)):
+        _, excess, _ = bright_texels.split_cells(Environment(jnp.asarray(light)))
+        used.append([bool(np.any(rows)) for rows in np.split(np.asarray(excess), [64, 128])])
+    assert used == [[True, False, True], [False, True, True]]
+
+
+def test_cells_need_faces_of_a_power_of_two_and_visibility_that_has_them(mesh, transport):
+    with pytest.raises(ValueError, match="power of two texels along an edge, got 24"):
+        bright_texels.split_cells(Environment(jnp.ones((6, 24, 24, 3))))
+    nothing = harmonic.DiffuseSystem(harmonic.precompute_diffuse(mesh, size=SIZE), jnp.zeros(3))
+    with pytest.raises(TypeError, match=r"which jaxprt\.lobe\.precompute makes"):
+        bright_texels.BrightTexels(nothing, transport, GLOSSY, cells=True)
+
+
+def test_smoother_materials_sum_more_places_of_a_cell(mesh):
+    """As when a rough part becomes smooth: with the middle alone each cell would be a dot."""
+    light, brdf = soft(), AshikhminShirley(diffuse=0.0, specular=0.8, nu=1500.0, nv=1500.0)
+    seen = precompute(mesh, size=32, run=Run(progress=False))
+    rest = lobe.LobeSystem(lobe.compress(seen), lobe.tabulate(brdf, lobes=4))
+    few, some, many = (
+        np.asarray(jaxprt.radiance(bright_texels.BrightTexels(rest, rest.transport, brdf, 8, n, True), light, eye=EYE))
+        for n in (1, 4, 12)
+    )
+    assert np.linalg.norm(few - many) > 0.1 * np.linalg.norm(many)
+    assert np.linalg.norm(some - many) < 0.1 * np.linalg.norm(few - many)

@@ -5,19 +5,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxprt import bright_texels, lobe, total
+from jaxprt import bright_texels, lobe, total, visibility
 from jaxprt.brdf import CookTorrance
 from jaxprt.scene import Environment, builtin
 from jaxprt.scene.points import VERTICES, Points
 from jaxprt.systems.lobe import widened
 from jaxprt.systems.lobe.table import LobeMixture
+from jaxprt.visibility import Run
 from tests.systems.scenes import SIZE, ball_on_ground, pyramids_on_ground, seen_on_ground
 
 pytestmark = pytest.mark.usefixtures("few_samples")
 EYE = jnp.array([1.2, 1.5, 2.5])
 BRDF = CookTorrance(diffuse=[0.3, 0.2, 0.1], roughness=0.2)
 LOBES = 0.03  # of all radiance: what lobes change of the BRDF of the brightest texels, and a texel's width as a lobe
-
+CELLS = 0.04  # the same with cells of 11 degrees as lobes, of which the BRDF is summed at the middle alone
 ENERGY = 0.04  # of all radiance in white light: what falls below the horizon or onto other surfaces
 
 
@@ -62,6 +63,17 @@ def test_unwidened_lobes_give_the_radiance_of_the_system(systems, close):
     close(lit(plain, light, 0.0), exact[0], tolerance=1e-5)
     found = lit(bright, light, 0.0)
     assert np.linalg.norm(found - exact[1]) < LOBES * np.linalg.norm(exact[1])
+
+
+def test_cells_of_the_light_are_seen_by_widened_lobes_as_by_the_brdf():
+    """At 6 x 16 x 16 texels, which have cells of 6 x 8 x 8."""
+    brdf, light = CookTorrance(diffuse=[0.3, 0.2, 0.1], roughness=0.5), builtin.studio(size=16)
+    stored = visibility.precompute(ball_on_ground(), size=16, run=Run(progress=False))
+    system = lobe.LobeSystem(lobe.compress(stored), lobe.tabulate(brdf, lobes=6, resolution=16))
+    both = bright_texels.BrightTexels(system, system.transport, brdf, count=8, samples=2, cells=True)
+    exact = np.asarray(both.combine(both.shade(both.light(light)), both.view(EYE)))
+    assert np.any(np.asarray(both.light(light).excess)[8:])
+    assert np.linalg.norm(lit(both, light, 0.0) - exact) < CELLS * np.linalg.norm(exact)
 
 
 def test_widening_keeps_energy_and_makes_highlights_wide(seen):
