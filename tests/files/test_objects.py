@@ -49,14 +49,18 @@ def classes():
                 yield kind
 
 
-def filled(kind, random):
-    """An instance, each field of which holds something of its type; nothing is converted or checked."""
+def filled(kind, random, within=()):
+    """An instance, each field of which holds something of its type; nothing is converted or checked.
+
+    What may hold another of its own kind does so once.
+    """
+    within = (*within, kind)
     hint = typing.get_type_hints(kind)
     if not issubclass(kind, eqx.Module):
-        return kind(*(value(hint[name], random) for name in kind._fields))
+        return kind(*(value(hint[name], random, within=within) for name in kind._fields))
     result = object.__new__(kind)
     for field in dataclasses.fields(kind):
-        object.__setattr__(result, field.name, value(hint[field.name], random, field.name))
+        object.__setattr__(result, field.name, value(hint[field.name], random, field.name, within))
     return result
 
 
@@ -66,14 +70,14 @@ def shape(axes):
     return [int(word) if word.isdigit() else 2 for word in words]
 
 
-def value(hint, random, name=""):
+def value(hint, random, name="", within=()):
     """Something of a type."""
     arguments = typing.get_args(hint)
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return None if name == "rough" else value(arguments[0], random, name)  # a table of its own kind
+        return None if within.count(arguments[0]) > 1 else value(arguments[0], random, name, within)
     if typing.get_origin(hint) is tuple:
         each = arguments[:1] * 2 if arguments[-1] is ... else arguments
-        return tuple(value(one, random) for one in each)
+        return tuple(value(one, random, within=within) for one in each)
     if typing.get_origin(hint) is dict:
         return {}
     if hasattr(hint, "dtypes"):
@@ -98,7 +102,7 @@ def value(hint, random, name=""):
     if hint is prt.systems.standard.StandardTable:
         return prt.systems.standard.METALLIC_ROUGHNESS
     if inspect.isclass(hint) and hint.__module__.startswith("jaxprt"):
-        return filled(hint, random)
+        return filled(hint, random, within)
     return {"coordinates": hemisphere.polar_coordinates, "chart": navigation._log_roughness}.get(
         name, prt.brdf.Lambert()
     )
