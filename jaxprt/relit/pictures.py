@@ -31,6 +31,7 @@ from jaxprt.relit.surface import TexelLight, Viewed, radiance, view
 from jaxprt.relit.tracing import Reflections
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.points import Points
+from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.protocol import light_for
 
@@ -359,7 +360,7 @@ def _colors_of_row(
     if row.index.ndim == 2:  # of a view that was made inside of `jax.jit`
         return [_colors_of_some(picture, row, light, apart=apart) for light in lights]
     if isinstance(row.viewed, Viewed):
-        return [_lit(surface, row, row.index, row.viewed, light, apart=apart) for light in lights]
+        return [_lit(picture, surface, row, row.index, row.viewed, light, apart=apart) for light in lights]
     # With `recompute`, derivatives compute again what depends on the view, which needs less memory.
     shade = partial(_shaded, picture, surface, row, row.index, lamps, apart)
     return (jax.checkpoint(shade) if recompute else shade)(lights)
@@ -378,11 +379,11 @@ def _shaded(
     points, on_group = canvas.points_of(picture.stage, picture.pixels, index)
     transport = None if lamps is None else lamps.row(row.group, index, on_group)
     seen = _seen(picture.stage, row.group, points, on_group, picture.camera, lamps=transport)
-    return [_lit(surface, row, index, seen, light, apart=apart) for light in lights]
+    return [_lit(picture, surface, row, index, seen, light, apart=apart) for light in lights]
 
 
 def _lit(
-    surface: Surface, row: Row, index: Any, seen: Viewed, light: RowLight, *, apart: bool
+    picture: PictureView, surface: Surface, row: Row, index: Any, seen: Viewed, light: RowLight, *, apart: bool
 ) -> tuple[Float[Array, "p c"], ...]:
     """Colors of points; if `apart`, also those without reflected light."""
     texels = None
@@ -391,6 +392,9 @@ def _lit(
     if light.traced is not None:
         texels = TexelLight(*shadows.of_points(light.traced, index), light.traced.rest.radiance.shape[-2], row.samples)
     direct, reflected, lamp = light.arriving.at(row.group)
+    if picture.lamp_rays and isinstance(surface.system, BrightTexels) and surface.system.cells:
+        where = picture.pixels, picture.camera.width, index, seen.points
+        direct = shadows.of_row(picture.stage, *where, direct, surface.system.squares)
     color = radiance(surface, (direct, reflected, lamp), seen, texels=texels, reflections=light.reflections)
     if not apart:
         return (color,)

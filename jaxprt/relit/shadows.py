@@ -8,6 +8,7 @@ Rays are cast on the host. They are constants of all derivatives.
 """
 
 import collections
+import dataclasses
 import threading
 import weakref
 from typing import Any
@@ -20,11 +21,14 @@ from jaxtyping import Array, Float, Int, UInt8
 from jaxprt.compile import compile_time, known, put
 from jaxprt.image.pixels import Pixels
 from jaxprt.relit.casting import caster
+from jaxprt.relit.groups import Stage
 from jaxprt.scene import Environment, Mesh, light_samples
 from jaxprt.scene import environment as environments
 from jaxprt.scene.panorama import Panorama
+from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap
 from jaxprt.systems import bright_texels
+from jaxprt.systems.bright_texels import BrightLight
 from jaxprt.visibility import picture_rays
 
 TEXELS = 16  # number of traced texels
@@ -32,6 +36,8 @@ _RANK = 2 * TEXELS  # What exceeds the flux of so many texels is traced; the sys
 _LEAST = 1e-3  # smallest share of the light's flux of a traced texel
 _MORE = 32  # rays of a point beyond one for each texel, if they had all of the light's flux
 _FINE = 256  # edge of the cubemap whose flux draws the places of rays within texels
+_APART = 15  # difference between corners of a triangle, in 240ths, above which what points between see is traced
+_EACH = 8  # rays of a point to a cell
 _FEWER = 0.7  # share of the wanted rays with which a texel that was traced before is not traced again
 _KEPT, _MOST = 4, 4 * TEXELS  # number of views whose traced texels are kept, and of texels of each
 
@@ -43,7 +49,7 @@ class TexelShares(eqx.Module):
 
     Attributes:
         texel: Indices of the texels.
-        share: Share of each texel that each point of the picture sees, in 255ths.
+        share: Share of each texel that each point of the picture sees, in 240ths.
         spot: Where in each texel the light of its file comes from; see `light_samples.spots_in_texels`.
     """
 
@@ -110,6 +116,39 @@ def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, k
     return TracedLight(rest, excess, TexelShares(texel, share, put(spot.astype(environment.radiance.dtype))))
 
 
+def of_row(
+    stage: Stage, pixels: Pixels, width: int, index: Int[np.ndarray, " p"], on_group: Points, light: Any, squares: Any
+) -> Any:
+    """The light with what points of a picture see of its texels and cells, by rays where the corners differ.
+
+    Args:
+        stage: The scene.
+        pixels: The points of the picture.
+        width: Width of the picture in drawn pixels.
+        index: Indices of the points; -1 in padding.
+        on_group: The points on their group.
+        light: The direct light of the group.
+        squares: Its `Squares`.
+    """
+    if not isinstance(light, BrightLight) or light.seen is None or not known(light, pixels, stage.whole, index):
+        return light
+    edge = np.repeat([square.edge for square in squares], [square.number for square in squares])
+    used = np.flatnonzero(np.asarray(light.excess).any(1))
+    corner, weight = np.asarray(on_group.corner), np.asarray(on_group.weight)
+    at = np.asarray(light.seen)[used][:, corner]
+    share = np.zeros((len(edge), len(index)), np.uint8)
+    share[used] = np.round(np.einsum("tkp,kp->tp", at, weight))
+    wanted = (at.max(1) - at.min(1) > _APART) & (index >= 0)
+    texel = np.asarray(light.texel)[used]
+    direction = np.stack([light_samples.evenly(*pair) for pair in zip(texel, edge[used], strict=True)])
+    rays = picture_rays.TexelRays(direction, np.full(len(used), _EACH))
+    points = _points(pixels, width, np.maximum(index, 0))
+    share[used] = picture_rays.shares(
+        stage.whole, caster(stage.whole).occluder, points, rays, known=share[used], wanted=wanted
+    )
+    return dataclasses.replace(light, here=put(share))
+
+
 def untraced(environment: Environment) -> Environment:
     """A light without what pictures trace of it."""
     return bright_texels.brightest(environment, count=TEXELS, rank=_RANK, least=_LEAST)[2]
@@ -132,10 +171,14 @@ def _finer(light: Environment) -> Float[np.ndarray, "6 m m c"]:
 
 
 def _cast(mesh: Mesh, pixels: Pixels, width: int, rays: picture_rays.TexelRays) -> UInt8[np.ndarray, "t p"]:
-    pixel = np.asarray(pixels.pixel)
-    triangle, barycentric, slope = (np.asarray(field) for field in (pixels.triangle, pixels.barycentric, pixels.slope))
-    points = picture_rays.PicturePoints(triangle, barycentric, slope, pixel // width, pixel % width)
-    return picture_rays.shares(mesh, caster(mesh).occluder, points, rays)
+    return picture_rays.shares(mesh, caster(mesh).occluder, _points(pixels, width, slice(None)), rays)
+
+
+def _points(pixels: Pixels, width: int, index: Any) -> picture_rays.PicturePoints:
+    """Some points of a picture, as rays take them."""
+    fields = pixels.triangle, pixels.barycentric, pixels.slope, pixels.pixel
+    triangle, barycentric, slope, pixel = (np.asarray(field)[index] for field in fields)
+    return picture_rays.PicturePoints(triangle, barycentric, slope, pixel // width, pixel % width)
 
 
 # For each view, the traced texels: number of rays, a direction of each, and the shares.

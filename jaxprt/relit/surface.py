@@ -64,7 +64,7 @@ class TexelLight(NamedTuple):
     Attributes:
         texel: Indices of the texels.
         excess: Their radiance.
-        share: Share of each texel that each point sees, in 255ths.
+        share: Share of each texel that each point sees, in 240ths.
         spot: Where in each texel its light comes from.
         size: Edge of the cubemap faces in texels.
         samples: Number of sample points along the edge of each texel.

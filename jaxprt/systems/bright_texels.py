@@ -28,6 +28,7 @@ from jaxprt.scene.points import VERTICES, Points, placed
 from jaxprt.sphere import cubemap, directions
 from jaxprt.systems import adaptive, protocol
 from jaxprt.systems.protocol import Blend, System, VertexSystem
+from jaxprt.visibility.picture_rays import FULL
 
 _ROW = 32  # texels per row, of which only the brightest is sorted at first
 # Numbers of cells that are taken out together, by the edge of a face in cells. The light chooses one of them.
@@ -35,7 +36,6 @@ _PLANS = {32: 64, 8: 32}, {16: 64, 8: 64}, {8: 64}
 _JUMP, _WITHIN = 16, 0.1  # edge of the means whose steps lobes cannot follow, and what steps within them count
 _WIDE = 4  # edge of the means about which steps are counted
 _WIDEST = 8  # edge of a face in the largest cells
-FULL = 240  # the share of a texel or cell that is all visible: sixteenths and quarters are whole numbers
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
 _TOGETHER = 32  # texels whose visibility is read at once
 _value = jit(adaptive.value)
@@ -85,6 +85,7 @@ class BrightLight(eqx.Module):
             ideally diffuse surfaces.
         flux: Vector irradiance / pi of every vertex by all of these texels, and then its irradiance / pi, for ideally
             diffuse surfaces; None before `BrightTexels.shade`, and for others.
+        here: Visible shares at the points of a view alone, in place of `seen`; None to interpolate.
     """
 
     rest: PyTree
@@ -92,6 +93,7 @@ class BrightLight(eqx.Module):
     excess: Float[Array, "t c"]
     seen: UInt8[Array, "t v"] | None = None
     flux: Float[Array, "c 4 v"] | None = None
+    here: UInt8[Array, "t p"] | None = None
 
 
 class BrightView(eqx.Module):
@@ -191,7 +193,8 @@ class BrightTexels(VertexSystem):
         light, rest = self._seen(light), self.system.combine(light.rest, view.rest, points)
         if light.flux is not None:
             return rest + self._diffuse(light.flux, view, points).T * self.system.diffuse_albedo(view.rest)
-        texels = light.texel, light.excess / FULL, light.seen
+        shares, points = (light.seen, points) if light.here is None else (light.here, VERTICES)
+        texels = light.texel, light.excess / FULL, shares
         brdf = grid.as_argument(self.brdf)
         return rest + texel_radiance(brdf, view.frame, view.wo, texels, points, view.blend, squares=self.squares)
 

@@ -65,7 +65,7 @@ def _edge_vector(position, first, last):
 
 
 @numba_loop
-def trace_shares(query, surface, points, first, last, texels, share):
+def trace_shares(query, surface, points, first, last, texels, wanted, share):
     """Visible shares of texels at points of a picture.
 
     Args:
@@ -75,7 +75,8 @@ def trace_shares(query, surface, points, first, last, texels, share):
         first: Index of the first point.
         last: Index after the last point.
         texels: Directions of the samples in each texel, of its middle, number of rays, and first sample.
-        share: The result, in 255ths [t, p].
+        wanted: Whether each texel is traced from each point [t, p].
+        share: The result, in 240ths [t, p], where it is wanted.
     """
     ray, valid, passed, _ = query
     pattern = points[3]
@@ -97,7 +98,7 @@ def trace_shares(query, surface, points, first, last, texels, share):
             for lane in range(16):
                 way = middle[texel]
                 cosine = facing[0, lane] * way[0] + facing[1, lane] * way[1] + facing[2, lane] * way[2]
-                above[lane] = lane < lanes and cosine > 0
+                above[lane] = lane < lanes and cosine > 0 and wanted[texel, packet + min(lane, lanes - 1)]
             traced = 0
             while traced < count[texel] and above.any():
                 if 4 * traced >= count[texel] and _agree(above, visible, traced):
@@ -118,7 +119,8 @@ def trace_shares(query, surface, points, first, last, texels, share):
                     visible[lane] += passed[lane] if above[lane] and ray[embree.FAR, lane] > 0 else 0.0
                 traced += 1
             for lane in range(lanes):
-                share[texel, packet + lane] = np.uint8(np.floor(255 * visible[lane] / max(traced, 1) + 0.5))
+                if wanted[texel, packet + lane]:
+                    share[texel, packet + lane] = np.uint8(np.floor(240 * visible[lane] / max(traced, 1) + 0.5))
 
 
 @numba_loop

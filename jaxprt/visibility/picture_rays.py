@@ -25,13 +25,13 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, Int64, Integer, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int64, Integer, UInt8
 
 from jaxprt.scene.mesh import Mesh
 from jaxprt.visibility import blocks
 from jaxprt.visibility.occluder import Occluder, offsets
 
-FULL = 255  # share of a texel that is visible completely
+FULL = 240  # share of a texel that is visible completely: sixteenths are whole numbers
 PLACES = 64  # places in each texel
 _PIECE = 1 << 11  # points that a thread traces at a time
 _BAYER = np.array([[0, 2], [3, 1]])
@@ -69,8 +69,16 @@ class TexelRays(NamedTuple):
     per_texel: Integer[np.ndarray, " t"]
 
 
-def shares(mesh: Mesh, occluder: Occluder, points: PicturePoints, rays: TexelRays) -> UInt8[np.ndarray, "t p"]:
-    """Visible share of each texel at each point, in 255ths.
+def shares(
+    mesh: Mesh,
+    occluder: Occluder,
+    points: PicturePoints,
+    rays: TexelRays,
+    *,
+    known: UInt8[np.ndarray, "t p"] | None = None,
+    wanted: Bool[np.ndarray, "t p"] | None = None,
+) -> UInt8[np.ndarray, "t p"]:
+    """Visible share of each texel at each point, in 240ths.
 
     Directions below the triangle of a point are blocked. Padding, and triangles without an area, see nothing.
 
@@ -79,14 +87,17 @@ def shares(mesh: Mesh, occluder: Occluder, points: PicturePoints, rays: TexelRay
         occluder: Geometry that casts shadows.
         points: The points.
         rays: Rays to the texels.
+        known: Shares where no rays are wanted; None if they are wanted everywhere.
+        wanted: Whether rays are traced from each point to each texel; None for all.
     """
     from jaxprt.visibility.picture_loops import trace_shares  # numba takes half a second to import
 
     # Texels start at different places, so that their dither patterns do not add up.
     first = (np.arange(len(rays.per_texel)) * 37) % PLACES
     texels = rays.direction, rays.direction.mean(1), np.asarray(rays.per_texel, np.int64), first
-    share = np.empty((len(rays.per_texel), len(points.triangle)), np.uint8)
-    _trace(trace_shares, mesh, occluder, points, texels, share)
+    size = len(rays.per_texel), len(points.triangle)
+    share = np.empty(size, np.uint8) if known is None else known.copy()
+    _trace(trace_shares, mesh, occluder, points, texels, np.ones(size, bool) if wanted is None else wanted, share)
     return share
 
 
