@@ -36,7 +36,6 @@ _RANK = 2 * TEXELS  # What exceeds the flux of so many texels is traced; the sys
 _LEAST = 1e-3  # smallest share of the light's flux of a traced texel
 _MORE = 32  # rays of a point beyond one for each texel, if they had all of the light's flux
 _FINE = 256  # edge of the cubemap whose flux draws the places of rays within texels
-_APART = 15  # difference between corners of a triangle, in 240ths, above which what points between see is traced
 _EACH = 8  # rays of a point to a cell
 _FEWER = 0.7  # share of the wanted rays with which a texel that was traced before is not traced again
 _KEPT, _MOST = 4, 4 * TEXELS  # number of views whose traced texels are kept, and of texels of each
@@ -134,18 +133,13 @@ def of_row(
         return light
     edge = np.repeat([square.edge for square in squares], [square.number for square in squares])
     used = np.flatnonzero(np.asarray(light.excess).any(1))
-    corner, weight = np.asarray(on_group.corner), np.asarray(on_group.weight)
-    at = np.asarray(light.seen)[used][:, corner]
-    share = np.zeros((len(edge), len(index)), np.uint8)
-    share[used] = np.round(np.einsum("tkp,kp->tp", at, weight))
-    wanted = (at.max(1) - at.min(1) > _APART) & (index >= 0)
-    texel = np.asarray(light.texel)[used]
+    texel, seen = np.asarray(light.texel)[used], np.asarray(light.seen)
     direction = np.stack([light_samples.evenly(*pair) for pair in zip(texel, edge[used], strict=True)])
-    rays = picture_rays.TexelRays(direction, np.full(len(used), _EACH))
-    points = _points(pixels, width, np.maximum(index, 0))
-    share[used] = picture_rays.shares(
-        stage.whole, caster(stage.whole).occluder, points, rays, known=share[used], wanted=wanted
-    )
+    rays, points = picture_rays.TexelRays(direction, np.full(len(used), _EACH)), _points(pixels, width, index)
+    points = points._replace(triangle=np.where(index < 0, -1, points.triangle))
+    share = np.zeros((len(edge), len(index)), np.uint8)
+    stored = seen[used], np.asarray(on_group.corner)
+    share[used] = picture_rays.shares(stage.whole, caster(stage.whole).occluder, points, rays, stored=stored)
     return dataclasses.replace(light, here=put(share))
 
 

@@ -11,6 +11,7 @@ from jaxprt.visibility import embree
 _ORIGINS = np.array([[-3, -1], [1, -3], [3, 1], [-1, 3]]) / 8  # ray origins in a pixel, from its center
 _GOLDEN = 0.618  # share of all rays between two turns
 _ENOUGH = 48  # rays of a packet that tell, if they agree, that others would agree with them
+_APART = 15  # 240ths by which corners of a triangle differ, above which what points between them see is traced
 _CLOSE = 6.0  # smallest distance to a sample of a lamp, in radii of a disk of its area
 _NEAR = 1e-3  # share of the distance to a sample, before it, in which hits count as hits of the lamp itself
 _QUARTERS = 4  # of a stratum
@@ -65,7 +66,7 @@ def _edge_vector(position, first, last):
 
 
 @numba_loop
-def trace_shares(query, surface, points, first, last, texels, wanted, share):
+def trace_shares(query, surface, points, first, last, texels, stored, share):
     """Visible shares of texels at points of a picture.
 
     Args:
@@ -75,15 +76,16 @@ def trace_shares(query, surface, points, first, last, texels, wanted, share):
         first: Index of the first point.
         last: Index after the last point.
         texels: Directions of the samples in each texel, of its middle, number of rays, and first sample.
-        wanted: Whether each texel is traced from each point [t, p].
-        share: The result, in 240ths [t, p], where it is wanted.
+        stored: Shares at vertices, which are interpolated where the corners of a point's triangle have about the same
+            [t, v], and the corners [3, p]; no vertices to trace all.
+        share: The result, in 240ths [t, p].
     """
     ray, valid, passed, _ = query
     pattern = points[3]
     direction, middle, count, shift = texels
     strata = direction.shape[1]
     origin, facing = np.zeros((4, 3, 16), np.float32), np.zeros((3, 16), np.float32)
-    above, visible = np.empty(16, np.bool_), np.empty(16)
+    above, even, visible = np.empty(16, np.bool_), np.empty(16, np.bool_), np.empty(16)
     step = np.empty(len(count), np.int64)  # between turns, so that the first ones are spread over the texel
     for texel in range(len(count)):
         step[texel] = max(1, int(_GOLDEN * count[texel]))
@@ -98,7 +100,9 @@ def trace_shares(query, surface, points, first, last, texels, wanted, share):
             for lane in range(16):
                 way = middle[texel]
                 cosine = facing[0, lane] * way[0] + facing[1, lane] * way[1] + facing[2, lane] * way[2]
-                above[lane] = lane < lanes and cosine > 0 and wanted[texel, packet + min(lane, lanes - 1)]
+                above[lane] = lane < lanes and cosine > 0
+                even[lane] = lane < lanes and _interpolated(stored, points, texel, packet + lane, share)
+                above[lane] = above[lane] and not even[lane]
             traced = 0
             while traced < count[texel] and above.any():
                 if 4 * traced >= count[texel] and _agree(above, visible, traced):
@@ -119,8 +123,23 @@ def trace_shares(query, surface, points, first, last, texels, wanted, share):
                     visible[lane] += passed[lane] if above[lane] and ray[embree.FAR, lane] > 0 else 0.0
                 traced += 1
             for lane in range(lanes):
-                if wanted[texel, packet + lane]:
+                if not even[lane]:
                     share[texel, packet + lane] = np.uint8(np.floor(240 * visible[lane] / max(traced, 1) + 0.5))
+
+
+@numba_loop
+def _interpolated(stored, points, texel, point, share):
+    """Sets the share of a texel that a point sees, and is True, if the corners of its triangle see about the same."""
+    seen, corner = stored
+    if seen.shape[1] == 0:
+        return False
+    first, second, third = seen[texel, corner[0, point]], seen[texel, corner[1, point]], seen[texel, corner[2, point]]
+    if max(first, second, third) - min(first, second, third) > _APART:
+        return False
+    weight = points[1]
+    value = first * weight[point, 0] + second * weight[point, 1] + third * weight[point, 2]
+    share[texel, point] = np.uint8(np.floor(value + 0.5))
+    return True
 
 
 @numba_loop

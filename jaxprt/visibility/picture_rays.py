@@ -25,7 +25,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int64, Integer, UInt8
+from jaxtyping import Float, Float32, Int, Int64, Integer, UInt8
 
 from jaxprt.scene.mesh import Mesh
 from jaxprt.visibility import blocks
@@ -75,8 +75,7 @@ def shares(
     points: PicturePoints,
     rays: TexelRays,
     *,
-    known: UInt8[np.ndarray, "t p"] | None = None,
-    wanted: Bool[np.ndarray, "t p"] | None = None,
+    stored: tuple[UInt8[np.ndarray, "t v"], Integer[np.ndarray, "3 p"]] | None = None,
 ) -> UInt8[np.ndarray, "t p"]:
     """Visible share of each texel at each point, in 240ths.
 
@@ -87,17 +86,19 @@ def shares(
         occluder: Geometry that casts shadows.
         points: The points.
         rays: Rays to the texels.
-        known: Shares where no rays are wanted; None if they are wanted everywhere.
-        wanted: Whether rays are traced from each point to each texel; None for all.
+        stored: Shares at vertices, and the corners of the triangle of each point among these vertices. Where the
+            corners have about the same, it is interpolated, without rays; None to trace all.
     """
     from jaxprt.visibility.picture_loops import trace_shares  # numba takes half a second to import
 
     # Texels start at different places, so that their dither patterns do not add up.
     first = (np.arange(len(rays.per_texel)) * 37) % PLACES
     texels = rays.direction, rays.direction.mean(1), np.asarray(rays.per_texel, np.int64), first
-    size = len(rays.per_texel), len(points.triangle)
-    share = np.empty(size, np.uint8) if known is None else known.copy()
-    _trace(trace_shares, mesh, occluder, points, texels, np.ones(size, bool) if wanted is None else wanted, share)
+    share = np.empty((len(rays.per_texel), len(points.triangle)), np.uint8)
+    if stored is None:
+        stored = np.empty((len(share), 0), np.uint8), np.empty((3, 0), np.int64)
+    seen, corner = (np.ascontiguousarray(*pair) for pair in zip(stored, (np.uint8, np.int64), strict=True))
+    _trace(trace_shares, mesh, occluder, points, texels, (seen, corner), share)
     return share
 
 
