@@ -87,6 +87,21 @@ def test_an_edge_inside_of_a_pixel_is_seen_by_its_share():
     np.testing.assert_array_equal(share, round(picture_rays.FULL / 4))
 
 
+def test_shares_of_corners_are_interpolated_where_they_agree_and_traced_where_they_do_not():
+    floor, lid = square(-2, 2, 0.0), square(-1, 0.3, 1.0, up=False)
+    occluder, place = Occluder(join([floor, lid])), np.random.default_rng(0).dirichlet([1, 1, 1], 100)
+    points, (_, rays) = points_on(floor, place), rays_up(count=16)
+    corner = np.tile(np.asarray(floor.face)[0][:, None], (1, 100))
+    seen = np.array([[240, 240, 240, 0], [120, 0, 126, 132], [0, 0, 0, 0], [240, 0, 240, 0]], np.uint8)
+    share = picture_rays.shares(floor, occluder, points, rays, stored=(seen, corner))
+    traced = picture_rays.shares(floor, occluder, points, rays)
+    same = np.ptp(seen[:, corner[:, 0]].astype(int), 1) <= 15
+    between = np.einsum("tk,pk->tp", seen[:, corner[:, 0]], place)
+    assert 0 < same.sum() < 4
+    assert np.abs(share[same] - between[same]).max() <= 0.5 + 1e-3
+    np.testing.assert_array_equal(share[~same], traced[~same])
+
+
 @pytest.mark.parametrize("bad", ["padding", "no area", "below"])
 def test_points_that_see_nothing_see_nothing(bad):
     floor = square(-1, 1, 0.0)
