@@ -18,6 +18,7 @@ from jaxprt.relit.groups import Stage
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.environment import background
 from jaxprt.scene.points import Points
+from jaxprt.visibility.picture_rays import PicturePoints
 
 ROW = 1 << 12  # number of points that are shaded together
 
@@ -62,6 +63,21 @@ def points_of(stage: Stage, pixels: Pixels, index: Any) -> tuple[Points, Points]
     of_group = corner - xp.asarray(shift)[corner]
     corner, of_group, weight, slope = put((corner, of_group, weight, slope))
     return Points(corner, weight, slope), Points(of_group, weight, slope)
+
+
+def traced(pixels: Pixels, width: int, index: Any = slice(None)) -> PicturePoints:
+    """Points of a picture for rays that start from them.
+
+    Args:
+        pixels: The points of the picture.
+        width: Width of the picture in drawn pixels.
+        index: Indices of the points, -1 in padding; all points by default.
+    """
+    fields = pixels.triangle, pixels.barycentric, pixels.slope, pixels.pixel
+    triangle, barycentric, slope, pixel = (np.asarray(field)[index] for field in fields)
+    if not isinstance(index, slice):
+        triangle = np.where(index < 0, -1, triangle)
+    return PicturePoints(triangle, barycentric, slope, pixel // width, pixel % width)
 
 
 def sky(

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from jaxprt.scene import Mesh
 from jaxprt.scene.points import Points
 from jaxprt.systems.bounces.traced import ReflectionRays
-from jaxprt.visibility import Occluder, point_starts, start_points
+from jaxprt.visibility import Occluder, picture_rays, point_starts, start_points
 from jaxprt.visibility.rays import first_fronts
 
 _CACHED = 4  # number of scenes that are cached
@@ -38,6 +38,11 @@ class Caster:
             for column in (self.normal, position)
         )
         return np.sqrt(turn / np.maximum(length, np.finfo(np.float32).tiny))
+
+    @cached_property
+    def triangles(self) -> tuple[np.ndarray, ...]:
+        """The triangles as rays from pictures start from them."""
+        return picture_rays.triangles(self.mesh)
 
     @cached_property
     def start(self) -> Float[np.ndarray, "v 3"]:

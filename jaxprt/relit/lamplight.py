@@ -12,6 +12,7 @@ from jaxtyping import Array, Int
 
 from jaxprt.compile import compile_time, known
 from jaxprt.image.pixels import Pixels
+from jaxprt.relit import canvas
 from jaxprt.relit.casting import Caster, caster
 from jaxprt.relit.groups import Stage
 from jaxprt.scene import Mesh, PointLight
@@ -78,17 +79,13 @@ class LampLight:
             index: Indices of the points among those of the picture; -1 in padding.
             on_group: The same points on the group.
         """
-        surface, index = self.stage.surfaces[group], np.asarray(index)
-        point = np.maximum(index, 0)
+        surface = self.stage.surfaces[group]
         with compile_time(surface.position, surface.frame, on_group):
             position, frame = placed(surface.position, surface.frame, on_group)
-        pixel = np.asarray(self.pixels.pixel)[point]
-        triangle = np.where(index < 0, -1, np.asarray(self.pixels.triangle)[point])
-        barycentric, slope = (np.asarray(column)[point] for column in (self.pixels.barycentric, self.pixels.slope))
-        points = picture_rays.PicturePoints(triangle, barycentric, slope, pixel // self.width, pixel % self.width)
+        points = canvas.traced(self.pixels, self.width, np.asarray(index))
         fields = np.asarray(position), np.asarray(frame)[:, 2]
         lamp_places = self._places_for(group)
-        moment = picture_rays.moments(self._caster.occluder, self._caster.mesh, points, *fields, lamp_places)
+        moment = picture_rays.moments(self._caster.triangles, self._caster.occluder, points, *fields, lamp_places)
         return at_points(moment, position, frame, self._sources, lamp_places.pieces)
 
 

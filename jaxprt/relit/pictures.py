@@ -26,12 +26,11 @@ from jaxprt.relit.lamplight import LampLight
 from jaxprt.relit.picture_layers import LIGHT
 from jaxprt.relit.picture_layers import check as check_layers
 from jaxprt.relit.picture_layers import of_points as geometry_layers
-from jaxprt.relit.shadows import TexelShares, TracedLight
+from jaxprt.relit.shadows import CellLight, TexelShares, TracedLight
 from jaxprt.relit.surface import TexelLight, Viewed, radiance, view
 from jaxprt.relit.tracing import Reflections
 from jaxprt.scene import Camera, Environment
 from jaxprt.scene.points import Points
-from jaxprt.systems.bright_texels import BrightTexels
 from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.protocol import light_for
 
@@ -71,7 +70,7 @@ class PictureView(eqx.Module):
         rows: The points in rows that are shaded together.
         reflected: Traced reflections of the points of sharp groups, in the order of their rows; None without.
         fold: Edge in drawn pixels of the squares that are averaged to one pixel of the picture.
-        shadows: "rays" to trace the brightest texels of each light; "vertices" to interpolate them.
+        shadows: "rays" to trace the brightest texels and cells of each light; "vertices" to interpolate them.
         keep: Whether what does not depend on the light is kept.
         shares: The texels that were traced when the view was made; None to choose them by each light.
         lamp_rays: Whether rays from the points are traced to lamps; otherwise their light is interpolated.
@@ -197,7 +196,10 @@ class PictureView(eqx.Module):
             # What rays hit is shaded with interpolated visibility, in the whole light.
             whole = arriving if traced is None else self.arriving(environment, None, share)
             reflections = tuple(self.reflected.radiance(self.stage, whole))
-        return PictureLight(arriving, traced, reflections, share)
+        cells: tuple[CellLight | None, ...] = (None,) * len(arriving.direct)
+        if self.shadows == "rays":
+            cells = tuple(shadows.cells(self.stage, self.pixels, self.camera.width, arriving.direct))
+        return PictureLight(arriving, traced, cells, reflections, share)
 
     def _colors(
         self, lights: Sequence["PictureLight"], apart: bool, between: Between
@@ -208,7 +210,9 @@ class PictureView(eqx.Module):
         traced, rows = 0, []
         for row in self.rows:
             sharp = row.group in self.stage.sharp_groups
-            of_row = [light.of_row(traced if sharp else None, _glow(self, row, light.share)) for light in lights]
+            of_row = [
+                light.of_row(row.group, traced if sharp else None, _glow(self, row, light.share)) for light in lights
+            ]
             traced += sharp
             colors = _colors_of_row(self, row, of_row, lamps, apart=apart, recompute=recompute)
             rows.append((row.index, finished(colors, between)))
@@ -250,12 +254,14 @@ class RowLight(NamedTuple):
     Attributes:
         arriving: The light that arrives at the scene, without what is taken out of traced texels.
         traced: The light with its traced texels; None without.
+        cells: Cells of the arriving light, to which rays are traced; None without.
         reflections: What reflection rays add; None without.
         glow: Share of what the points emit; None for all of it.
     """
 
     arriving: Arriving
     traced: TracedLight | None
+    cells: CellLight | None
     reflections: Float[Array, "p c"] | None
     glow: Float[Array, " p"] | None
 
@@ -266,18 +272,21 @@ class PictureLight(NamedTuple):
     Attributes:
         arriving: The light that arrives at the scene, without what is taken out of traced texels.
         traced: The light with its traced texels; None without.
+        cells: For each group, cells of the arriving light, to which rays are traced; None without.
         reflections: What reflection rays add, for each row of sharp groups.
         share: Share of each lamp; None for all of it.
     """
 
     arriving: Arriving
     traced: TracedLight | None
+    cells: tuple[CellLight | None, ...]
     reflections: tuple[Float[Array, "_ c"], ...]
     share: Float[np.ndarray, " n"] | None
 
-    def of_row(self, number: int | None, glow: Float[Array, " p"] | None) -> RowLight:
-        """The light of a row; `number` is its index among the rows of sharp groups, None for others."""
-        return RowLight(self.arriving, self.traced, None if number is None else self.reflections[number], glow)
+    def of_row(self, group: int, number: int | None, glow: Float[Array, " p"] | None) -> RowLight:
+        """The light of a row of a group; `number` is its index among the rows of sharp groups, None for others."""
+        reflections = None if number is None else self.reflections[number]
+        return RowLight(self.arriving, self.traced, self.cells[group], reflections, glow)
 
 
 def check(taker: Any, environments: Sequence[Any], *, shadows: Any = "rays") -> None:
@@ -360,7 +369,7 @@ def _colors_of_row(
     if row.index.ndim == 2:  # of a view that was made inside of `jax.jit`
         return [_colors_of_some(picture, row, light, apart=apart) for light in lights]
     if isinstance(row.viewed, Viewed):
-        return [_lit(picture, surface, row, row.index, row.viewed, light, apart=apart) for light in lights]
+        return [_lit(surface, row, row.index, row.viewed, light, apart=apart) for light in lights]
     # With `recompute`, derivatives compute again what depends on the view, which needs less memory.
     shade = partial(_shaded, picture, surface, row, row.index, lamps, apart)
     return (jax.checkpoint(shade) if recompute else shade)(lights)
@@ -379,11 +388,11 @@ def _shaded(
     points, on_group = canvas.points_of(picture.stage, picture.pixels, index)
     transport = None if lamps is None else lamps.row(row.group, index, on_group)
     seen = _seen(picture.stage, row.group, points, on_group, picture.camera, lamps=transport)
-    return [_lit(picture, surface, row, index, seen, light, apart=apart) for light in lights]
+    return [_lit(surface, row, index, seen, light, apart=apart) for light in lights]
 
 
 def _lit(
-    picture: PictureView, surface: Surface, row: Row, index: Any, seen: Viewed, light: RowLight, *, apart: bool
+    surface: Surface, row: Row, index: Any, seen: Viewed, light: RowLight, *, apart: bool
 ) -> tuple[Float[Array, "p c"], ...]:
     """Colors of points; if `apart`, also those without reflected light."""
     texels = None
@@ -392,9 +401,8 @@ def _lit(
     if light.traced is not None:
         texels = TexelLight(*shadows.of_points(light.traced, index), light.traced.rest.radiance.shape[-2], row.samples)
     direct, reflected, lamp = light.arriving.at(row.group)
-    if picture.lamp_rays and isinstance(surface.system, BrightTexels) and surface.system.cells:
-        where = picture.pixels, picture.camera.width, index, seen.points
-        direct = shadows.of_row(picture.stage, *where, direct, surface.system.squares)
+    if light.cells is not None:
+        direct = light.cells.row(index, seen.points)
     color = radiance(surface, (direct, reflected, lamp), seen, texels=texels, reflections=light.reflections)
     if not apart:
         return (color,)

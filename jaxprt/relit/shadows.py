@@ -11,6 +11,8 @@ import collections
 import dataclasses
 import threading
 import weakref
+from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import Any
 
 import equinox as eqx
@@ -20,6 +22,7 @@ from jaxtyping import Array, Float, Int, UInt8
 
 from jaxprt.compile import compile_time, known, put
 from jaxprt.image.pixels import Pixels
+from jaxprt.relit import canvas
 from jaxprt.relit.casting import caster
 from jaxprt.relit.groups import Stage
 from jaxprt.scene import Environment, Mesh, light_samples
@@ -28,7 +31,7 @@ from jaxprt.scene.panorama import Panorama
 from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap
 from jaxprt.systems import bright_texels
-from jaxprt.systems.bright_texels import BrightLight
+from jaxprt.systems.bright_texels import BrightLight, BrightTexels, Squares
 from jaxprt.visibility import picture_rays
 
 TEXELS = 16  # number of traced texels
@@ -36,7 +39,7 @@ _RANK = 2 * TEXELS  # What exceeds the flux of so many texels is traced; the sys
 _LEAST = 1e-3  # smallest share of the light's flux of a traced texel
 _MORE = 32  # rays of a point beyond one for each texel, if they had all of the light's flux
 _FINE = 256  # edge of the cubemap whose flux draws the places of rays within texels
-_EACH = 8  # rays of a point to a cell
+_CELL_RAYS = 128  # rays of a point to all cells beyond one for each, in proportion to their flux
 _FEWER = 0.7  # share of the wanted rays with which a texel that was traced before is not traced again
 _KEPT, _MOST = 4, 4 * TEXELS  # number of views whose traced texels are kept, and of texels of each
 
@@ -115,32 +118,72 @@ def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, k
     return TracedLight(rest, excess, TexelShares(texel, share, put(spot.astype(environment.radiance.dtype))))
 
 
-def of_row(
-    stage: Stage, pixels: Pixels, width: int, index: Int[np.ndarray, " p"], on_group: Points, light: Any, squares: Any
-) -> Any:
-    """The light with what points of a picture see of its texels and cells, by rays where the corners differ.
+@dataclasses.dataclass(frozen=True)
+class CellLight:
+    """The texels and cells of the light that arrives at a group, and the points of a picture.
+
+    Attributes:
+        mesh: The mesh of all parts of the scene.
+        pixels: The points of the picture.
+        width: Width of the picture in drawn pixels.
+        light: The light at the vertices of the group.
+        squares: Sizes of the texels and cells.
+    """
+
+    mesh: Mesh
+    pixels: Pixels
+    width: int
+    light: BrightLight
+    squares: tuple[Squares, ...]
+
+    @cached_property
+    def _rays(self) -> tuple[np.ndarray, np.ndarray, picture_rays.TexelRays]:
+        """Which texels and cells bring light, their shares at vertices [v, t], and rays to even places in them."""
+        texel, excess = np.asarray(self.light.texel), np.asarray(self.light.excess, np.float64).sum(1)
+        used, direction, flux, first = [], [], [], 0
+        for edge, count, _ in self.squares:
+            here = first + np.flatnonzero(excess[first : first + count])
+            if len(here):
+                even = np.broadcast_to(np.float32(0), (6, 8 * edge, 8 * edge, 1))
+                direction.append(light_samples.in_texels(texel[here], even, size=edge, count=picture_rays.PLACES))
+                flux.append(excess[here] * np.asarray(cubemap.solid_angle(size=edge)).ravel()[texel[here]])
+                used.append(here)
+            first += count
+        chosen = np.concatenate(used)
+        flux = np.abs(np.concatenate(flux))
+        count = np.clip(1 + np.round(_CELL_RAYS * flux / flux.sum()).astype(int), 1, picture_rays.PLACES)
+        rays = picture_rays.TexelRays(np.concatenate(direction), count)
+        return chosen, np.ascontiguousarray(np.asarray(self.light.seen)[chosen].T), rays
+
+    def row(self, index: Int[np.ndarray, " p"], on_group: Points) -> BrightLight:
+        """The light with what some points see of it, by rays where the corners of a triangle see different shares.
+
+        Args:
+            index: Indices of the points; -1 in padding.
+            on_group: The same points on their group.
+        """
+        chosen, seen, rays = self._rays
+        points = canvas.traced(self.pixels, self.width, index)
+        share, stored = np.zeros((len(self.light.texel), len(index)), np.uint8), (seen, np.asarray(on_group.corner))
+        cast = caster(self.mesh)
+        share[chosen] = picture_rays.shares(cast.triangles, cast.occluder, points, rays, stored=stored)
+        return dataclasses.replace(self.light, here=put(share))
+
+
+def cells(stage: Stage, pixels: Pixels, width: int, direct: Sequence[Any]) -> Iterator[CellLight | None]:
+    """Cells of the light that arrives at each group; None without, or if JAX traces the light, the mesh or the points.
 
     Args:
         stage: The scene.
         pixels: The points of the picture.
         width: Width of the picture in drawn pixels.
-        index: Indices of the points; -1 in padding.
-        on_group: The points on their group.
-        light: The direct light of the group.
-        squares: Its `Squares`.
+        direct: Direct light at each group, in the form of its system.
     """
-    if not isinstance(light, BrightLight) or light.seen is None or not known(light, pixels, stage.whole, index):
-        return light
-    edge = np.repeat([square.edge for square in squares], [square.number for square in squares])
-    used = np.flatnonzero(np.asarray(light.excess).any(1))
-    texel, seen = np.asarray(light.texel)[used], np.asarray(light.seen)
-    direction = np.stack([light_samples.evenly(*pair) for pair in zip(texel, edge[used], strict=True)])
-    rays, points = picture_rays.TexelRays(direction, np.full(len(used), _EACH)), _points(pixels, width, index)
-    points = points._replace(triangle=np.where(index < 0, -1, points.triangle))
-    share = np.zeros((len(edge), len(index)), np.uint8)
-    stored = seen[used], np.asarray(on_group.corner)
-    share[used] = picture_rays.shares(stage.whole, caster(stage.whole).occluder, points, rays, stored=stored)
-    return dataclasses.replace(light, here=put(share))
+    for surface, light in zip(stage.surfaces, direct, strict=True):
+        system = surface.system
+        has = isinstance(system, BrightTexels) and system.cells and known(stage.whole, pixels, light)
+        lit = has and np.asarray(light.excess).any()
+        yield CellLight(stage.whole, pixels, width, light, system.squares) if lit else None
 
 
 def untraced(environment: Environment) -> Environment:
@@ -165,14 +208,8 @@ def _finer(light: Environment) -> Float[np.ndarray, "6 m m c"]:
 
 
 def _cast(mesh: Mesh, pixels: Pixels, width: int, rays: picture_rays.TexelRays) -> UInt8[np.ndarray, "t p"]:
-    return picture_rays.shares(mesh, caster(mesh).occluder, _points(pixels, width, slice(None)), rays)
-
-
-def _points(pixels: Pixels, width: int, index: Any) -> picture_rays.PicturePoints:
-    """Some points of a picture, as rays take them."""
-    fields = pixels.triangle, pixels.barycentric, pixels.slope, pixels.pixel
-    triangle, barycentric, slope, pixel = (np.asarray(field)[index] for field in fields)
-    return picture_rays.PicturePoints(triangle, barycentric, slope, pixel // width, pixel % width)
+    cast = caster(mesh)
+    return picture_rays.shares(cast.triangles, cast.occluder, canvas.traced(pixels, width), rays)
 
 
 # For each view, the traced texels: number of rays, a direction of each, and the shares.

@@ -148,16 +148,6 @@ def spots_in_texels(
     return np.stack([*mean, *spread], -1)
 
 
-def evenly(texel: int, size: int) -> Float32[np.ndarray, "64 3"]:
-    """64 directions that are spread evenly over a texel, along a space-filling curve."""
-    down, across = np.divmod(_curve(8)[:64], 8)
-    face, row, column = texel // size**2, texel // size % size, texel % size
-    s, t = (2 * (start + (step + 0.5) / 8) / size - 1 for start, step in ((column, across), (row, down)))
-    axis = cubemap.axes()[face]
-    way = s[:, None] * axis[0] + t[:, None] * axis[1] + axis[2]
-    return (way / np.linalg.norm(way, axis=-1, keepdims=True)).astype(np.float32)
-
-
 def in_texels(
     texel: Int[np.ndarray, " t"], radiance: Float[np.ndarray, "6 m m c"], *, size: int, count: int
 ) -> Float32[np.ndarray, "t n 3"]:

@@ -37,6 +37,7 @@ _JUMP, _WITHIN = 16, 0.1  # edge of the means whose steps lobes cannot follow, a
 _WIDE = 4  # edge of the means about which steps are counted
 _WIDEST = 8  # edge of a face in the largest cells
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
+_BLOCK = 16  # sample points that are left out together
 _TOGETHER = 32  # texels whose visibility is read at once
 _value = jit(adaptive.value)
 
@@ -539,18 +540,19 @@ def texel_radiance(
 
     def lit(argument):
         direction, area, number = argument
+        share = visible[number] if carried else points.carry(visible[number])
+        reflected = point(direction, area) * share.astype(wo.dtype)
+        if weight is not None:
+            reflected = jnp.sum(reflected[:, None] * weight, 0)
+        return reflected * excess[number][:, None]
 
-        def seen(visible):
-            share = visible if carried else points.carry(visible)
-            reflected = point(direction, area) * share.astype(wo.dtype)
-            if weight is not None:
-                reflected = jnp.sum(reflected[:, None] * weight, 0)
-            return reflected * excess[number][:, None]
-
-        row = visible[number]
-        shape = jax.eval_shape(seen, row)
-        # No vertex of many rows sees a texel: those of a face that looks away, and texels that do not stand out.
-        return jax.lax.cond(jnp.any(row > 0), seen, lambda _: jnp.zeros(shape.shape, shape.dtype), row)
+    def block(rows):
+        # No vertex of many rows sees some texels, such as those that do not stand out. A branch costs as much as three
+        # texels, so that several have one.
+        sent = partial(total, lit)
+        shape = jax.eval_shape(sent, rows)
+        none = partial(jnp.zeros, shape.shape, shape.dtype)
+        return jax.lax.cond(jnp.any(visible[rows[2]] > 0), sent, lambda _: none(), rows)
 
     def point(direction, area):
         wi = jnp.stack([_component(axis, direction) for axis in frame])
@@ -568,7 +570,14 @@ def texel_radiance(
     # Sample points are processed one by one, so that intermediate arrays stay in the processor's cache. A loop over the
     # points of a texel within one over texels takes three times as long on CPUs.
     direction, area, number = _sample_points(texel, squares, spot)
-    return total(lit, (direction.astype(excess.dtype), area.astype(excess.dtype), number)).T
+    rows = direction.astype(excess.dtype), area.astype(excess.dtype), number
+    return total(block, jax.tree.map(_blocks, rows)).T
+
+
+def _blocks(value: Array) -> Array:
+    """Rows in blocks; the last one is filled up with zeros."""
+    rest = -len(value) % _BLOCK
+    return jnp.pad(value, ((0, rest), *[(0, 0)] * (value.ndim - 1))).reshape(-1, _BLOCK, *value.shape[1:])
 
 
 @partial(jit, static_argnames=("numbers",))

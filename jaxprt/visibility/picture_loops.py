@@ -11,7 +11,8 @@ from jaxprt.visibility import embree
 _ORIGINS = np.array([[-3, -1], [1, -3], [3, 1], [-1, 3]]) / 8  # ray origins in a pixel, from its center
 _GOLDEN = 0.618  # share of all rays between two turns
 _ENOUGH = 48  # rays of a packet that tell, if they agree, that others would agree with them
-_APART = 15  # 240ths by which corners of a triangle differ, above which what points between them see is traced
+_BLOCK = 128  # points whose rays to a texel are traced one packet after another
+_APART = 60  # 240ths by which corners of a triangle differ, above which what points between them see is traced
 _CLOSE = 6.0  # smallest distance to a sample of a lamp, in radii of a disk of its area
 _NEAR = 1e-3  # share of the distance to a sample, before it, in which hits count as hits of the lamp itself
 _QUARTERS = 4  # of a stratum
@@ -77,80 +78,89 @@ def trace_shares(query, surface, points, first, last, texels, stored, share):
         last: Index after the last point.
         texels: Directions of the samples in each texel, of its middle, number of rays, and first sample.
         stored: Shares at vertices, which are interpolated where the corners of a point's triangle have about the same
-            [t, v], and the corners [3, p]; no vertices to trace all.
+            [v, t], and the corners [3, p]; no vertices to trace all.
         share: The result, in 240ths [t, p].
     """
-    ray, valid, passed, _ = query
-    pattern = points[3]
-    direction, middle, count, shift = texels
-    strata = direction.shape[1]
-    origin, facing = np.zeros((4, 3, 16), np.float32), np.zeros((3, 16), np.float32)
-    above, even, visible = np.empty(16, np.bool_), np.empty(16, np.bool_), np.empty(16)
+    _, middle, count, _ = texels
+    origin, facing = np.zeros((4, 3, _BLOCK), np.float32), np.zeros((3, _BLOCK), np.float32)
+    value, apart = np.zeros(len(count), np.uint8), np.ones(len(count), np.bool_)
+    wanted, lane, visible = np.ones((len(count), _BLOCK), np.bool_), np.empty(_BLOCK, np.int64), np.empty(16)
     step = np.empty(len(count), np.int64)  # between turns, so that the first ones are spread over the texel
     for texel in range(len(count)):
         step[texel] = max(1, int(_GOLDEN * count[texel]))
         while np.gcd(step[texel], count[texel]) > 1:
             step[texel] += 1
-    for packet in range(first, last, 16):
-        lanes = min(16, last - packet)
-        for lane in range(lanes):
-            _start(surface, points, packet + lane, lane, origin, facing)
+    for block in range(first, last, _BLOCK):
+        size = min(_BLOCK, last - block)
+        for number in range(size):
+            _start(surface, points, block + number, number, origin, facing)
+            if len(stored[0]):
+                _interpolate(stored, points, block + number, value, apart)
+            for texel in range(len(count)):
+                share[texel, block + number], wanted[texel, number] = value[texel], apart[texel]
         for texel in range(len(count)):
-            visible[:] = 0
-            for lane in range(16):
-                way = middle[texel]
-                cosine = facing[0, lane] * way[0] + facing[1, lane] * way[1] + facing[2, lane] * way[2]
-                above[lane] = lane < lanes and cosine > 0
-                even[lane] = lane < lanes and _interpolated(stored, points, texel, packet + lane, share)
-                above[lane] = above[lane] and not even[lane]
-            traced = 0
-            while traced < count[texel] and above.any():
-                if 4 * traced >= count[texel] and _agree(above, visible, traced):
-                    break
-                turn = traced * step[texel] % count[texel]
-                for lane in range(16):
-                    here = min(lane, lanes - 1)
-                    base = pattern[packet + here]
-                    stratum = ((base + turn * strata) // count[texel] + shift[texel]) % strata
-                    spot = (base // 4 + base + texel + turn) % 4
-                    valid[lane] = -1 if above[lane] else 0
-                    for axis in range(3):
-                        ray[embree.ORIGIN + axis, lane] = origin[spot, axis, here]
-                        ray[embree.DIRECTION + axis, lane] = direction[texel, stratum, axis]
-                ray[embree.FAR], passed[:] = embree.ENDLESS, 1
-                embree.trace(query, embree.RAY)
-                for lane in range(lanes):
-                    visible[lane] += passed[lane] if above[lane] and ray[embree.FAR, lane] > 0 else 0.0
-                traced += 1
-            for lane in range(lanes):
-                if not even[lane]:
-                    share[texel, packet + lane] = np.uint8(np.floor(240 * visible[lane] / max(traced, 1) + 0.5))
+            way, some = middle[texel], 0
+            for number in range(size):
+                cosine = facing[0, number] * way[0] + facing[1, number] * way[1] + facing[2, number] * way[2]
+                if wanted[texel, number] and cosine > 0:
+                    lane[some] = number
+                    some += 1
+                elif wanted[texel, number]:
+                    share[texel, block + number] = 0
+            for packet in range(0, some, 16):
+                here = lane[packet : min(packet + 16, some)]
+                traced = _trace_texel(query, origin, points[3][block:], here, texel, texels, step[texel], visible)
+                for number in range(len(here)):
+                    share[texel, block + here[number]] = np.uint8(np.floor(240 * visible[number] / traced + 0.5))
 
 
 @numba_loop
-def _interpolated(stored, points, texel, point, share):
-    """Sets the share of a texel that a point sees, and is True, if the corners of its triangle see about the same."""
+def _interpolate(stored, points, point, value, apart):
+    """Shares that a point sees, between those of the corners of its triangle, and where these are apart."""
     seen, corner = stored
-    if seen.shape[1] == 0:
-        return False
-    first, second, third = seen[texel, corner[0, point]], seen[texel, corner[1, point]], seen[texel, corner[2, point]]
-    if max(first, second, third) - min(first, second, third) > _APART:
-        return False
-    weight = points[1]
-    value = first * weight[point, 0] + second * weight[point, 1] + third * weight[point, 2]
-    share[texel, point] = np.uint8(np.floor(value + 0.5))
-    return True
+    first, second, third = seen[corner[0, point]], seen[corner[1, point]], seen[corner[2, point]]
+    weight = points[1][point]
+    for texel in range(len(value)):
+        a, b, c = np.float32(first[texel]), np.float32(second[texel]), np.float32(third[texel])
+        apart[texel] = max(max(a, b), c) - min(min(a, b), c) > _APART
+        value[texel] = np.uint8(a * weight[0] + b * weight[1] + c * weight[2] + np.float32(0.5))
 
 
 @numba_loop
-def _agree(above, visible, traced):
+def _trace_texel(query, origin, pattern, lane, texel, texels, step, visible):
+    """Number of rays from each of at most sixteen points of a block to a texel, and how many of them pass."""
+    ray, valid, passed, _ = query
+    direction, _, count, shift = texels
+    strata, lanes = direction.shape[1], len(lane)
+    visible[:] = 0
+    for number in range(16):
+        valid[number] = -1 if number < lanes else 0
+    traced = 0
+    while traced < count[texel]:
+        if 4 * traced >= count[texel] and _agree(visible, lanes, traced):
+            break
+        turn = traced * step % count[texel]
+        for number in range(16):
+            here = lane[min(number, lanes - 1)]
+            base = pattern[here]
+            stratum = ((base + turn * strata) // count[texel] + shift[texel]) % strata
+            spot = (base // 4 + base + texel + turn) % 4
+            for axis in range(3):
+                ray[embree.ORIGIN + axis, number] = origin[spot, axis, here]
+                ray[embree.DIRECTION + axis, number] = direction[texel, stratum, axis]
+        ray[embree.FAR], passed[:] = embree.ENDLESS, 1
+        embree.trace(query, embree.RAY)
+        for number in range(lanes):
+            visible[number] += passed[number] if ray[embree.FAR, number] > 0 else 0.0
+        traced += 1
+    return traced
+
+
+@numba_loop
+def _agree(visible, lanes, traced):
     """Whether enough rays have been traced, and all of all points have passed, or none."""
-    clear, count = 0.0, 0
-    for lane in range(16):
-        if above[lane]:
-            clear += visible[lane]
-            count += traced
-    return count >= _ENOUGH and (clear == 0 or clear == count)
+    clear = visible[:lanes].sum()
+    return lanes * traced >= _ENOUGH and (clear == 0 or clear == lanes * traced)
 
 
 @_unchecked

@@ -69,20 +69,26 @@ class TexelRays(NamedTuple):
     per_texel: Integer[np.ndarray, " t"]
 
 
+def triangles(mesh: Mesh) -> tuple[np.ndarray, ...]:
+    """The triangles of a mesh, on which points lie, as loops take them."""
+    position, face = np.asarray(mesh.position, np.float32), np.ascontiguousarray(mesh.face, np.int32)
+    return position, np.asarray(mesh.normal, np.float32), face, offsets(position, face)
+
+
 def shares(
-    mesh: Mesh,
+    surface: tuple[np.ndarray, ...],
     occluder: Occluder,
     points: PicturePoints,
     rays: TexelRays,
     *,
-    stored: tuple[UInt8[np.ndarray, "t v"], Integer[np.ndarray, "3 p"]] | None = None,
+    stored: tuple[UInt8[np.ndarray, "v t"], Integer[np.ndarray, "3 p"]] | None = None,
 ) -> UInt8[np.ndarray, "t p"]:
     """Visible share of each texel at each point, in 240ths.
 
     Directions below the triangle of a point are blocked. Padding, and triangles without an area, see nothing.
 
     Args:
-        mesh: The mesh of the points.
+        surface: The triangles of the points, from `triangles`.
         occluder: Geometry that casts shadows.
         points: The points.
         rays: Rays to the texels.
@@ -96,18 +102,20 @@ def shares(
     texels = rays.direction, rays.direction.mean(1), np.asarray(rays.per_texel, np.int64), first
     share = np.empty((len(rays.per_texel), len(points.triangle)), np.uint8)
     if stored is None:
-        stored = np.empty((len(share), 0), np.uint8), np.empty((3, 0), np.int64)
+        stored = np.empty((0, len(share)), np.uint8), np.empty((3, 0), np.int64)
     seen, corner = (np.ascontiguousarray(*pair) for pair in zip(stored, (np.uint8, np.int64), strict=True))
-    _trace(trace_shares, mesh, occluder, points, texels, (seen, corner), share)
+    _trace(trace_shares, surface, occluder, points, texels, (seen, corner), share)
     return share
 
 
 def _trace(
-    loop: Callable, mesh: Mesh, occluder: Occluder, points: PicturePoints, *arguments: tuple | np.ndarray
+    loop: Callable,
+    surface: tuple[np.ndarray, ...],
+    occluder: Occluder,
+    points: PicturePoints,
+    *arguments: tuple | np.ndarray,
 ) -> None:
     """Runs a loop of `jaxprt.visibility.picture_loops` over all points, on every processor."""
-    position, face = np.asarray(mesh.position, np.float32), np.ascontiguousarray(mesh.face, np.int32)
-    surface = position, np.asarray(mesh.normal, np.float32), face, offsets(position, face)
     barycentric, slope = (np.ascontiguousarray(value, np.float32) for value in points[1:3])
     pattern = _BAYER[points.row % 8, points.column % 8]
     drawn = np.ascontiguousarray(points.triangle, np.int64), barycentric, slope, pattern
@@ -145,8 +153,8 @@ class LampPlaces(NamedTuple):
 
 
 def moments(
+    surface: tuple[np.ndarray, ...],
     occluder: Occluder,
-    mesh: Mesh,
     points: PicturePoints,
     position: Float[np.ndarray, "p 3"],
     normal: Float[np.ndarray, "p 3"],
@@ -158,8 +166,8 @@ def moments(
     an area, see nothing.
 
     Args:
+        surface: The triangles of the points, from `triangles`.
         occluder: Geometry that casts shadows: all of the mesh.
-        mesh: The mesh of the points.
         points: The points.
         position: Their positions.
         normal: Their shading normals.
@@ -170,5 +178,5 @@ def moments(
     fields = tuple(np.ascontiguousarray(vector, np.float32) for vector in (position, normal))
     size = int(lamps.pieces.sum()), len(position)
     result = np.empty(size, np.float32), np.empty(size, np.float32), np.empty((size[0], 3, size[1]), np.float32)
-    _trace(trace_lamps, mesh, occluder, points, fields, tuple(lamps), result)
+    _trace(trace_lamps, surface, occluder, points, fields, tuple(lamps), result)
     return result

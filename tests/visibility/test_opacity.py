@@ -122,15 +122,15 @@ def test_rays_from_pixels_pass_what_rays_of_vertices_pass():
     for field in ({"alpha_mode": "mask"}, {"alpha_mode": "blend"}, {"alpha_mode": "blend", "back": "lit"}):
         mesh = two_sided(scene(**field)).mesh
         occluder = Occluder(mesh)
-        share = picture_rays.shares(mesh, occluder, points, rays)
+        share = picture_rays.shares(picture_rays.triangles(mesh), occluder, points, rays)
         corner = np.asarray(mesh.position)[np.asarray(mesh.face)[points.triangle]]
         place = np.einsum("pk,pki->pi", spot, corner).astype(np.float32) + np.array([0, 1e-6, 0], np.float32)
         number, texel = np.tile(np.arange(count), 2), np.repeat(np.arange(2), count)
         passed = occluder.passed(place, way, number, texel).reshape(2, count)
         # A ray in a thousand may pass the edge of a hole on the other side.
-        assert np.mean(np.abs(share / 255 - passed) > 1 / 255) < 1e-3
-        assert np.mean(share < 255) > 0.1
-        assert np.any((share > 0) & (share < 255)) == (field["alpha_mode"] == "blend")
+        assert np.mean(np.abs(share / picture_rays.FULL - passed) > 1 / picture_rays.FULL) < 1e-3
+        assert np.mean(share < picture_rays.FULL) > 0.1
+        assert np.any((share > 0) & (share < picture_rays.FULL)) == (field["alpha_mode"] == "blend")
 
 
 def test_lamps_shine_through_what_lets_light_pass():
@@ -148,7 +148,7 @@ def test_lamps_shine_through_what_lets_light_pass():
         mesh = scene(**field).mesh
         corner = np.asarray(mesh.position)[np.asarray(mesh.face)[0]]
         place, up = points.barycentric @ corner, np.array([[0.0, 1, 0]])
-        return picture_rays.moments(Occluder(mesh), mesh, points, place, up, lamp)[0], place
+        return picture_rays.moments(picture_rays.triangles(mesh), Occluder(mesh), points, place, up, lamp)[0], place
 
     open_, place = light(alpha_texture=None, alpha=0.0, alpha_mode="mask")
     assert all(np.any(moment != 0) for moment in open_)

@@ -49,7 +49,7 @@ def test_shares_are_those_of_single_rays_to_every_place():
     random = np.random.default_rng(0)
     place = random.dirichlet([1, 1, 1], 100)
     points, (_, rays) = points_on(floor, place), rays_up(count=picture_rays.PLACES)
-    share = picture_rays.shares(floor, occluder, points, rays)
+    share = picture_rays.shares(picture_rays.triangles(floor), occluder, points, rays)
     corner = np.asarray(floor.position)[np.asarray(floor.face)[0]]
     start = (place @ corner + [0, 1e-5, 0]).astype(np.float32)
     for texel, direction in enumerate(rays.direction):
@@ -65,7 +65,9 @@ def test_rays_that_are_left_out_where_others_agree_lose_no_thin_shadow():
     occluder, (_, rays) = Occluder(join([floor, bar])), rays_up(count=picture_rays.PLACES)
     first = np.linspace(0.44, 0.56, 400)
     place = np.stack([first, 0.05 * np.ones(400), 0.95 - first], -1)
-    share = picture_rays.shares(floor, occluder, points_on(floor, place), rays) / picture_rays.FULL
+    share = (
+        picture_rays.shares(picture_rays.triangles(floor), occluder, points_on(floor, place), rays) / picture_rays.FULL
+    )
     start = (place @ np.asarray(floor.position)[np.asarray(floor.face)[0]] + [0, 1e-5, 0]).astype(np.float32)
     for row, direction in zip(share, rays.direction, strict=True):
         point, way = (each.ravel() for each in np.indices((len(start), len(direction))))
@@ -83,7 +85,7 @@ def test_an_edge_inside_of_a_pixel_is_seen_by_its_share():
     corner = np.asarray(floor.position)[np.asarray(floor.face)[0]]
     beside = place[0] @ corner - [0.25 * step * (corner[0] - corner[1])[0], 0, -2]
     occluder = Occluder(join([floor, make_mesh(np.asarray(lid.position) + beside, np.asarray(lid.face))]))
-    share = picture_rays.shares(floor, occluder, points, rays)
+    share = picture_rays.shares(picture_rays.triangles(floor), occluder, points, rays)
     np.testing.assert_array_equal(share, round(picture_rays.FULL / 4))
 
 
@@ -93,8 +95,8 @@ def test_shares_of_corners_are_interpolated_where_they_agree_and_traced_where_th
     points, (_, rays) = points_on(floor, place), rays_up(count=16)
     corner = np.tile(np.asarray(floor.face)[0][:, None], (1, 100))
     seen = np.array([[240, 240, 240, 0], [120, 0, 126, 132], [0, 0, 0, 0], [240, 0, 240, 0]], np.uint8)
-    share = picture_rays.shares(floor, occluder, points, rays, stored=(seen, corner))
-    traced = picture_rays.shares(floor, occluder, points, rays)
+    share = picture_rays.shares(picture_rays.triangles(floor), occluder, points, rays, stored=(seen.T, corner))
+    traced = picture_rays.shares(picture_rays.triangles(floor), occluder, points, rays)
     same = np.ptp(seen[:, corner[:, 0]].astype(int), 1) <= 15
     between = np.einsum("tk,pk->tp", seen[:, corner[:, 0]], place)
     assert 0 < same.sum() < 4
@@ -112,7 +114,7 @@ def test_points_that_see_nothing_see_nothing(bad):
         floor = make_mesh(np.zeros((4, 3)), np.asarray(floor.face), normal=np.tile([[0.0, 1, 0]], (4, 1)))
     if bad == "below":
         rays = TexelRays(-rays.direction, rays.per_texel)
-    share = picture_rays.shares(floor, Occluder(square(-1, 1, 0.0)), points, rays)
+    share = picture_rays.shares(picture_rays.triangles(floor), Occluder(square(-1, 1, 0.0)), points, rays)
     assert not share.any()
 
 
@@ -184,7 +186,7 @@ def seen(lamps, *others: Mesh) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
     position, normal = np.stack([x, 0 * x, z], 1), np.tile([0.0, 1, 0], (EDGE**2, 1))
     mesh = join([GROUND, *(lamp for lamp in lamps if isinstance(lamp, Mesh)), *others])
     own = places(lamps, np.ones(len(lamps)))
-    return position, picture_rays.moments(Occluder(mesh), mesh, points, position, normal, own)
+    return position, picture_rays.moments(picture_rays.triangles(mesh), Occluder(mesh), points, position, normal, own)
 
 
 def off(got: np.ndarray, expected: np.ndarray) -> float:

@@ -68,8 +68,10 @@ def tracers() -> dict[str, Callable[[], bytes]]:
         "passed": lambda: flat(clear.passed(origin, way, index, index)),
         "hit": lambda: flat(*clear.hit(origin, way)),
         "layers": lambda: flat(*clear.translucent.layers(origin[0], way, far, np.zeros(len(mixed.face), bool))),
-        "shares": lambda: flat(picture_rays.shares(mixed, clear, points, texel)),
-        "lamps": lambda: flat(*picture_rays.moments(opaque, stone, points, position, normal, bulb)),
+        "shares": lambda: flat(picture_rays.shares(picture_rays.triangles(mixed), clear, points, texel)),
+        "lamps": lambda: flat(
+            *picture_rays.moments(picture_rays.triangles(stone), opaque, points, position, normal, bulb)
+        ),
         "visibility": lambda: flat(rays.fractional(opaque, start, np.asarray(stone.normal)[:64], size=16)[0]),
     }
 
