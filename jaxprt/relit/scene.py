@@ -404,8 +404,9 @@ class RelitScene(System):
             samples: Samples of each pixel: 4, 1 for no anti-aliasing, or 16 for final pictures. 16 takes longer
                 than 4, and matters where sharp highlights are smaller than a pixel.
             shadows: "rays" traces shadows of the brightest texels from the points of the picture, so that they are
-                sharp on any mesh. "vertices" interpolates visibility between vertices, which is always done where JAX
-                traces the light or the camera. Rays are constants of derivatives.
+                sharp on any mesh, and of cells of the light where they differ between vertices. "vertices" interpolates
+                visibility between vertices, which is always done where JAX traces the light or the camera. Rays are
+                constants of derivatives.
             background: What is seen where no surface is: "light" for the environment, another `Environment`, or None
                 for nothing. Without a background the picture has a last channel, alpha, and its colors are those of the
                 surfaces times alpha, as in EXR files.
@@ -525,7 +526,7 @@ class RelitScene(System):
             samples: As for `picture`.
             shadows: "rays" and "vertices" as in `picture`. With "rays", texels that earlier lights had in common are
                 not traced again. A light traces its brightest texels now, for all pictures of the view, also inside of
-                `jax.jit`.
+                `jax.jit`; cells are then interpolated.
         """
         return self._picture_view(camera, materials, samples=samples, keep=True, shadow=shadows, between=None)
 

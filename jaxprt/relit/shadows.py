@@ -4,6 +4,9 @@ The radiance by which a few texels exceed the rest of the light is taken out of 
 rest, with visibility that is interpolated between vertices. What the texels add is the product of radiance, BRDF and
 cosine at the point itself, times the share of the texel that rays from the point see.
 
+Cells of the light, which the systems `lobe` and `dynamic` sum too, are many. Their shares are interpolated where the
+corners of a triangle see about the same of them, and traced elsewhere.
+
 Rays are cast on the host. They are constants of all derivatives.
 """
 

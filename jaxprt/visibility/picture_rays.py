@@ -4,8 +4,8 @@ Visibility that is interpolated between vertices has the shadow of a sun wrong w
 of the shadow. Rays from the points themselves have it right on every mesh. They start at four places of each pixel, so
 that edges are anti-aliased, and go to places within the texel that are drawn by the flux of the light at a finer
 resolution, so that a sun that is smaller than a texel keeps its size. The places of neighboring pixels differ by a
-dither pattern. Where the first quarter of the rays of sixteen neighboring points, 48 at least, agree, no more are
-traced.
+dither pattern. Where the first quarter of the rays of sixteen points close to each other, 48 at least, agree, no more
+are traced. None are where the corners of a triangle are known to see about the same.
 
 What vertices see of a lamp, interpolated, has soft shadows wrong where triangles are larger than the shadows. Here each
 point of a picture has its own integrals, as `jaxprt.systems.lamps.transport` defines them. They are products of two

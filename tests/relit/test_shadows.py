@@ -1,12 +1,16 @@
 """Shadows of bright texels by rays from the points of pictures, beside closed forms."""
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxprt as prt
 from jaxprt.relit import Lobes, shadows
-from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial
+from jaxprt.relit.exact import exact_pixels
+from jaxprt.scene import Camera, Environment, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.mesh import make_mesh
 from jaxprt.sphere import cubemap
 
@@ -95,6 +99,52 @@ def test_a_kept_view_traces_new_texels_alone(relit, monkeypatch):
         traced.clear()
         np.testing.assert_allclose(color, relit.picture(light), rtol=1e-5, atol=1e-6)
         traced.clear()
+
+
+@pytest.fixture(scope="module")
+def glossy():
+    """A rough metal of few vertices below a bar, and three soft boxes, two of them low."""
+    grid = builtin.plane(cells=5)
+    bar = make_mesh(SQUARE * [0.15, 0, 1.2] + [0, 0.35, 0], FACE)
+    metal = TexturedMaterial(metallic=1.0, roughness=0.9)
+    parts = [Part("floor", grid, metal), Part("bar", bar, metal)]
+    ready = prt.precompute(Scene(parts, [CAMERA]), refine=False, system=Lobes(4, 4), size=16, progress=False)
+    radiance = np.full((6, 16, 16, 3), 0.05)
+    for face, row, column in ((2, 6, 10), (2, 8, 2), (0, 4, 6)):
+        radiance[face, row : row + 2, column : column + 2] = 20, 15, 10
+    return ready, Environment(jnp.asarray(radiance, jnp.float32))
+
+
+def test_soft_boxes_are_hidden_where_they_are_between_vertices(glossy):
+    ready, light = glossy
+    rays, vertices = (np.asarray(ready.picture(light, shadows=way)) for way in ("rays", "vertices"))
+    exact = exact_pixels(ready.scene, ready.shading, [light], CAMERA, pixels=300)
+
+    def off(picture):
+        there = exact.part == 0
+        wrong = picture.reshape(-1, 3)[exact.pixel] - exact.color[0]
+        return np.linalg.norm(wrong[there]) / np.linalg.norm(exact.color[0][there])
+
+    assert exact.error[0] < 0.02
+    assert off(rays) < 0.06
+    assert off(vertices) > 2.5 * off(rays)
+    view = ready.picture_view()
+    for of_light in (light, Environment(light.radiance[..., ::-1]), light):
+        np.testing.assert_allclose(view.picture(of_light), ready.picture(of_light), rtol=1e-5, atol=1e-6)
+    # What JAX traces, and a view for one light, interpolates the shares of cells.
+    fixed = ready.picture_view(shadows=light)
+    np.testing.assert_allclose(
+        jax.jit(lambda light: fixed.picture(light))(light), fixed.picture(light), rtol=1e-4, atol=1e-5
+    )
+
+
+def test_groups_of_rough_parts_have_cells(glossy):
+    ready, _ = glossy
+    floor, bar = ready.scene.parts
+    smooth = dataclasses.replace(bar, material=TexturedMaterial(metallic=1.0, roughness=0.3))
+    mixed = prt.precompute(Scene([floor, smooth]), refine=False, system=Lobes(4, 4), size=16, progress=False)
+    assert [group.system.cells for group in ready.surfaces] == [True]
+    assert [group.system.cells for group in mixed.surfaces] == [False]
 
 
 @pytest.mark.usefixtures("unchecked")
