@@ -184,9 +184,11 @@ def cells(stage: Stage, pixels: Pixels, width: int, direct: Sequence[Any]) -> It
     """
     for surface, light in zip(stage.surfaces, direct, strict=True):
         system = surface.system
-        has = isinstance(system, BrightTexels) and system.cells and known(stage.whole, pixels, light)
-        lit = has and np.asarray(light.excess).any()
-        yield CellLight(stage.whole, pixels, width, light, system.squares) if lit else None
+        if not isinstance(system, BrightTexels) or not system.cells or not known(stage.whole, pixels, light):
+            yield None
+        else:
+            lit = np.asarray(light.excess).any()
+            yield CellLight(stage.whole, pixels, width, light, system.squares) if lit else None
 
 
 def untraced(environment: Environment) -> Environment:
