@@ -27,7 +27,7 @@ from jax._src.core import trace_state_clean
 from jax.core import Tracer
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from jaxprt.programs import executables, jax_cache
 
@@ -35,6 +35,7 @@ Between = Callable[[], None] | None  # called between the steps of a long comput
 Fixed = TypeVar("Fixed", bound=PyTree)
 Function = TypeVar("Function", bound=Callable)
 
+TOGETHER = 16  # rows of a sum that CPUs skip together
 _ROOM = 1 << 28  # bytes of results that loops compute at once on GPUs
 
 # jaxlib 0.10.2, the newest for Python 3.11, fuses sums of products wrongly on CPUs (jax-ml/jax#39103). Without these
@@ -186,18 +187,32 @@ def _always(_: Array) -> Array:
     return jnp.asarray(True)
 
 
-def total(term: Callable[[PyTree], Array], rows: PyTree) -> Array:
+def total(
+    term: Callable[[PyTree], Array], rows: PyTree, *, counts: Callable[[PyTree], Bool[Array, ""]] | None = None
+) -> Array:
     """Sums a function over rows: on CPUs one row after another, elsewhere as many rows at once as memory permits.
 
     Args:
         term: Function of one row.
         rows: Arrays with the rows along the first axis.
+        counts: Whether any of `TOGETHER` rows counts, of which there must be a multiple. CPUs skip those of which none
+            does, whose terms must be zero. A branch for each row would take longer than many terms.
     """
     shape = jax.eval_shape(term, _first(rows))
     start = jnp.zeros(shape.shape, shape.dtype)
 
+    def added(carry, rows):
+        return jax.lax.scan(lambda carry, row: (carry + term(row), None), carry, rows)[0]
+
     def by_row(rows):
-        return jax.lax.scan(lambda carry, row: (carry + term(row), None), start, rows)[0]
+        if counts is None:
+            return added(start, rows)
+
+        def some(carry, rows, counts=counts):
+            return jax.lax.cond(counts(rows), added, lambda carry, _: carry, carry, rows), None
+
+        blocks = jax.tree.map(lambda leaf: leaf.reshape(-1, TOGETHER, *leaf.shape[1:]), rows)
+        return jax.lax.scan(some, start, blocks)[0]
 
     def at_once(rows):
         return jnp.sum(jax.vmap(term)(rows), 0, dtype=shape.dtype)

@@ -22,7 +22,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree, UInt8
 
 from jaxprt import require
 from jaxprt.brdf import grid
-from jaxprt.compile import jit, mapped, total
+from jaxprt.compile import TOGETHER, jit, mapped, total
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import VERTICES, Points, placed
 from jaxprt.sphere import cubemap, directions
@@ -37,7 +37,6 @@ _JUMP, _WITHIN = 16, 0.1  # edge of the means whose steps lobes cannot follow, a
 _WIDE = 4  # edge of the means about which steps are counted
 _WIDEST = 8  # edge of a face in the largest cells
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
-_BLOCK = 16  # sample points that are left out together
 _TOGETHER = 32  # texels whose visibility is read at once
 _value = jit(adaptive.value)
 
@@ -546,13 +545,9 @@ def texel_radiance(
             reflected = jnp.sum(reflected[:, None] * weight, 0)
         return reflected * excess[number][:, None]
 
-    def block(rows):
-        # No vertex of many rows sees some texels, such as those that do not stand out. A branch costs as much as three
-        # texels, so that several have one.
-        sent = partial(total, lit)
-        shape = jax.eval_shape(sent, rows)
-        none = partial(jnp.zeros, shape.shape, shape.dtype)
-        return jax.lax.cond(jnp.any(visible[rows[2]] > 0), sent, lambda _: none(), rows)
+    def counts(rows):
+        # No vertex of many rows sees some texels, such as those that do not stand out.
+        return jnp.any(visible[rows[2]] > 0)
 
     def point(direction, area):
         wi = jnp.stack([_component(axis, direction) for axis in frame])
@@ -570,14 +565,12 @@ def texel_radiance(
     # Sample points are processed one by one, so that intermediate arrays stay in the processor's cache. A loop over the
     # points of a texel within one over texels takes three times as long on CPUs.
     direction, area, number = _sample_points(texel, squares, spot)
-    rows = direction.astype(excess.dtype), area.astype(excess.dtype), number
-    return total(block, jax.tree.map(_blocks, rows)).T
-
-
-def _blocks(value: Array) -> Array:
-    """Rows in blocks; the last one is filled up with zeros."""
-    rest = -len(value) % _BLOCK
-    return jnp.pad(value, ((0, rest), *[(0, 0)] * (value.ndim - 1))).reshape(-1, _BLOCK, *value.shape[1:])
+    # The last point is repeated without an area. A direction of zero would have derivatives that are not finite.
+    real = np.arange(-(-len(number) // TOGETHER) * TOGETHER)
+    index = np.minimum(real, len(number) - 1)
+    area = jnp.where((real < len(number))[:, None], area[index], 0)
+    rows = direction[index].astype(excess.dtype), area.astype(excess.dtype), number[index]
+    return total(lit, rows, counts=counts).T
 
 
 @partial(jit, static_argnames=("numbers",))

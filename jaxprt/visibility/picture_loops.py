@@ -123,7 +123,8 @@ def _interpolate(stored, points, point, value, apart):
     for texel in range(len(value)):
         a, b, c = np.float32(first[texel]), np.float32(second[texel]), np.float32(third[texel])
         apart[texel] = max(max(a, b), c) - min(min(a, b), c) > _APART
-        value[texel] = np.uint8(a * weight[0] + b * weight[1] + c * weight[2] + np.float32(0.5))
+        between = max(a * weight[0] + b * weight[1] + c * weight[2], np.float32(0))
+        value[texel] = np.uint8(between + np.float32(0.5))
 
 
 @numba_loop
