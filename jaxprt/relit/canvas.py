@@ -65,13 +65,13 @@ def points_of(stage: Stage, pixels: Pixels, index: Any) -> tuple[Points, Points]
     return Points(corner, weight, slope), Points(of_group, weight, slope)
 
 
-def traced(pixels: Pixels, width: int, index: Any = slice(None)) -> PicturePoints:
+def traced(pixels: Pixels, width: int, index: Any) -> PicturePoints:
     """Points of a picture for rays that start from them.
 
     Args:
         pixels: The points of the picture.
         width: Width of the picture in drawn pixels.
-        index: Indices of the points, -1 in padding; all points by default.
+        index: Indices of the points, -1 in padding, or a slice.
     """
     fields = pixels.triangle, pixels.barycentric, pixels.slope, pixels.pixel
     triangle, barycentric, slope, pixel = (np.asarray(field)[index] for field in fields)

@@ -214,7 +214,7 @@ def _finer(light: Environment) -> Float[np.ndarray, "6 m m c"]:
 
 def _cast(mesh: Mesh, pixels: Pixels, width: int, rays: picture_rays.TexelRays) -> UInt8[np.ndarray, "t p"]:
     cast = caster(mesh)
-    return picture_rays.shares(cast.triangles, cast.occluder, canvas.traced(pixels, width), rays)
+    return picture_rays.shares(cast.triangles, cast.occluder, canvas.traced(pixels, width, slice(None)), rays)
 
 
 # For each view, the traced texels: number of rays, a direction of each, and the shares.
