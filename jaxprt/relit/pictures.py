@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt8
 
 from jaxprt import require
 from jaxprt.compile import Between, compile_time, finished, jit, known, promoted, put
@@ -210,9 +210,7 @@ class PictureView(eqx.Module):
         traced, rows = 0, []
         for row in self.rows:
             sharp = row.group in self.stage.sharp_groups
-            of_row = [
-                light.of_row(row.group, traced if sharp else None, _glow(self, row, light.share)) for light in lights
-            ]
+            of_row = [light.of_row(row, traced if sharp else None, _glow(self, row, light.share)) for light in lights]
             traced += sharp
             colors = _colors_of_row(self, row, of_row, lamps, apart=apart, recompute=recompute)
             rows.append((row.index, finished(colors, between)))
@@ -254,14 +252,14 @@ class RowLight(NamedTuple):
     Attributes:
         arriving: The light that arrives at the scene, without what is taken out of traced texels.
         traced: The light with its traced texels; None without.
-        cells: Cells of the arriving light, to which rays are traced; None without.
+        cells: Visible shares of texels and cells of the arriving light by rays; None to interpolate them.
         reflections: What reflection rays add; None without.
         glow: Share of what the points emit; None for all of it.
     """
 
     arriving: Arriving
     traced: TracedLight | None
-    cells: CellLight | None
+    cells: UInt8[Array, "t p"] | None
     reflections: Float[Array, "p c"] | None
     glow: Float[Array, " p"] | None
 
@@ -283,10 +281,11 @@ class PictureLight(NamedTuple):
     reflections: tuple[Float[Array, "_ c"], ...]
     share: Float[np.ndarray, " n"] | None
 
-    def of_row(self, group: int, number: int | None, glow: Float[Array, " p"] | None) -> RowLight:
-        """The light of a row of a group; `number` is its index among the rows of sharp groups, None for others."""
-        reflections = None if number is None else self.reflections[number]
-        return RowLight(self.arriving, self.traced, self.cells[group], reflections, glow)
+    def of_row(self, row: Row, number: int | None, glow: Float[Array, " p"] | None) -> RowLight:
+        """The light of a row; `number` is its index among the rows of sharp groups, None for others."""
+        reflections, cells = None if number is None else self.reflections[number], self.cells[row.group]
+        shares = None if cells is None else cells.row(np.asarray(row.index))
+        return RowLight(self.arriving, self.traced, shares, reflections, glow)
 
 
 def check(taker: Any, environments: Sequence[Any], *, shadows: Any = "rays") -> None:
@@ -402,7 +401,7 @@ def _lit(
         texels = TexelLight(*shadows.of_points(light.traced, index), light.traced.rest.radiance.shape[-2], row.samples)
     direct, reflected, lamp = light.arriving.at(row.group)
     if light.cells is not None:
-        direct = light.cells.row(index, seen.points)
+        direct = dataclasses.replace(direct, here=light.cells)
     color = radiance(surface, (direct, reflected, lamp), seen, texels=texels, reflections=light.reflections)
     if not apart:
         return (color,)

@@ -11,12 +11,10 @@ Rays are cast on the host. They are constants of all derivatives.
 """
 
 import collections
-import dataclasses
 import threading
 import weakref
 from collections.abc import Iterator, Sequence
-from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -31,7 +29,6 @@ from jaxprt.relit.groups import Stage
 from jaxprt.scene import Environment, Mesh, light_samples
 from jaxprt.scene import environment as environments
 from jaxprt.scene.panorama import Panorama
-from jaxprt.scene.points import Points
 from jaxprt.sphere import cubemap
 from jaxprt.systems import bright_texels
 from jaxprt.systems.bright_texels import BrightLight, BrightTexels, Squares
@@ -121,56 +118,56 @@ def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, k
     return TracedLight(rest, excess, TexelShares(texel, share, put(spot.astype(environment.radiance.dtype))))
 
 
-@dataclasses.dataclass(frozen=True)
-class CellLight:
+class CellLight(NamedTuple):
     """The texels and cells of the light that arrives at a group, and the points of a picture.
 
     Attributes:
-        mesh: The mesh of all parts of the scene.
+        stage: The scene.
         pixels: The points of the picture.
         width: Width of the picture in drawn pixels.
-        light: The light at the vertices of the group.
-        squares: Sizes of the texels and cells.
+        count: Number of texels and cells.
+        chosen: Indices of those that bring light.
+        seen: Their shares at the vertices of the group.
+        rays: Rays to even places in them.
     """
 
-    mesh: Mesh
+    stage: Stage
     pixels: Pixels
     width: int
-    light: BrightLight
-    squares: tuple[Squares, ...]
+    count: int
+    chosen: Int[np.ndarray, " n"]
+    seen: UInt8[np.ndarray, "v n"]
+    rays: picture_rays.TexelRays
 
-    @cached_property
-    def _rays(self) -> tuple[np.ndarray, np.ndarray, picture_rays.TexelRays]:
-        """Which texels and cells bring light, their shares at vertices [v, t], and rays to even places in them."""
-        texel, excess = np.asarray(self.light.texel), np.asarray(self.light.excess, np.float64).sum(1)
-        used, direction, flux, first = [], [], [], 0
-        for edge, count, _ in self.squares:
-            here = first + np.flatnonzero(excess[first : first + count])
-            if len(here):
-                even = np.broadcast_to(np.float32(0), (6, 8 * edge, 8 * edge, 1))
-                direction.append(light_samples.in_texels(texel[here], even, size=edge, count=picture_rays.PLACES))
-                flux.append(excess[here] * np.asarray(cubemap.solid_angle(size=edge)).ravel()[texel[here]])
-                used.append(here)
-            first += count
-        chosen = np.concatenate(used)
-        flux = np.abs(np.concatenate(flux))
-        count = np.clip(1 + np.round(_CELL_RAYS * flux / flux.sum()).astype(int), 1, picture_rays.PLACES)
-        rays = picture_rays.TexelRays(np.concatenate(direction), count)
-        return chosen, np.ascontiguousarray(np.asarray(self.light.seen)[chosen].T), rays
-
-    def row(self, index: Int[np.ndarray, " p"], on_group: Points) -> BrightLight:
-        """The light with what some points see of it, by rays where the corners of a triangle see different shares.
+    def row(self, index: Int[np.ndarray, " p"]) -> UInt8[Array, "t p"]:
+        """What some points of the group see, by rays where the corners of a triangle see different shares.
 
         Args:
             index: Indices of the points; -1 in padding.
-            on_group: The same points on their group.
         """
-        chosen, seen, rays = self._rays
-        points = canvas.traced(self.pixels, self.width, index)
-        share, stored = np.zeros((len(self.light.texel), len(index)), np.uint8), (seen, np.asarray(on_group.corner))
-        cast = caster(self.mesh)
-        share[chosen] = picture_rays.shares(cast.triangles, cast.occluder, points, rays, stored=stored)
-        return dataclasses.replace(self.light, here=put(share))
+        points, cast = canvas.traced(self.pixels, self.width, index), caster(self.stage.whole)
+        corner = np.asarray(self.stage.face)[np.maximum(points.triangle, 0)].T
+        stored = self.seen, corner - np.asarray(self.stage.shift)[corner]
+        share = np.zeros((self.count, len(index)), np.uint8)
+        share[self.chosen] = picture_rays.shares(cast.triangles, cast.occluder, points, self.rays, stored=stored)
+        return put(share)
+
+
+def _rays_to(light: BrightLight, squares: Sequence[Squares]) -> tuple[np.ndarray, picture_rays.TexelRays]:
+    """Which texels and cells bring light, and rays to even places in them, more to those with more flux."""
+    texel, excess = np.asarray(light.texel), np.asarray(light.excess, np.float64).sum(1)
+    used, direction, flux, first = [], [], [], 0
+    for edge, count, _ in squares:
+        here = first + np.flatnonzero(excess[first : first + count])
+        if len(here):
+            even = np.broadcast_to(np.float32(0), (6, 8 * edge, 8 * edge, 1))
+            direction.append(light_samples.in_texels(texel[here], even, size=edge, count=picture_rays.PLACES))
+            flux.append(excess[here] * np.asarray(cubemap.solid_angle(size=edge)).ravel()[texel[here]])
+            used.append(here)
+        first += count
+    power = np.abs(np.concatenate(flux))
+    count = np.clip(1 + np.round(_CELL_RAYS * power / power.sum()).astype(int), 1, picture_rays.PLACES)
+    return np.concatenate(used), picture_rays.TexelRays(np.concatenate(direction), count)
 
 
 def cells(stage: Stage, pixels: Pixels, width: int, direct: Sequence[Any]) -> Iterator[CellLight | None]:
@@ -184,11 +181,17 @@ def cells(stage: Stage, pixels: Pixels, width: int, direct: Sequence[Any]) -> It
     """
     for surface, light in zip(stage.surfaces, direct, strict=True):
         system = surface.system
-        if not isinstance(system, BrightTexels) or not system.cells or not known(stage.whole, pixels, light):
+        if (
+            not isinstance(system, BrightTexels)
+            or not system.cells
+            or not known(stage.whole, pixels, light)
+            or not np.asarray(light.excess).any()
+        ):
             yield None
         else:
-            lit = np.asarray(light.excess).any()
-            yield CellLight(stage.whole, pixels, width, light, system.squares) if lit else None
+            chosen, rays = _rays_to(light, system.squares)
+            seen = np.ascontiguousarray(np.asarray(light.seen)[chosen].T)
+            yield CellLight(stage, pixels, width, len(light.texel), chosen, seen, rays)
 
 
 def untraced(environment: Environment) -> Environment:
