@@ -125,7 +125,7 @@ class CellLight(NamedTuple):
         stage: The scene.
         pixels: The points of the picture.
         width: Width of the picture in drawn pixels.
-        count: Number of texels and cells.
+        number: Number of texels and cells.
         chosen: Indices of those that bring light.
         seen: Their shares at the vertices of the group.
         rays: Rays to even places in them.
@@ -134,7 +134,7 @@ class CellLight(NamedTuple):
     stage: Stage
     pixels: Pixels
     width: int
-    count: int
+    number: int
     chosen: Int[np.ndarray, " n"]
     seen: UInt8[np.ndarray, "v n"]
     rays: picture_rays.TexelRays
@@ -148,7 +148,7 @@ class CellLight(NamedTuple):
         points, cast = canvas.traced(self.pixels, self.width, index), caster(self.stage.whole)
         corner = np.asarray(self.stage.face)[np.maximum(points.triangle, 0)].T
         stored = self.seen, corner - np.asarray(self.stage.shift)[corner]
-        share = np.zeros((self.count, len(index)), np.uint8)
+        share = np.zeros((self.number, len(index)), np.uint8)
         share[self.chosen] = picture_rays.shares(cast.triangles, cast.occluder, points, self.rays, stored=stored)
         return put(share)
 
