@@ -65,19 +65,17 @@ def points_of(stage: Stage, pixels: Pixels, index: Any) -> tuple[Points, Points]
     return Points(corner, weight, slope), Points(of_group, weight, slope)
 
 
-def traced(pixels: Pixels, width: int, index: Any) -> PicturePoints:
+def traced(pixels: Pixels, width: int, index: Int[np.ndarray, " p"]) -> PicturePoints:
     """Points of a picture for rays that start from them.
 
     Args:
         pixels: The points of the picture.
         width: Width of the picture in drawn pixels.
-        index: Indices of the points, -1 in padding, or a slice.
+        index: Indices of the points; -1 in padding.
     """
     fields = pixels.triangle, pixels.barycentric, pixels.slope, pixels.pixel
     triangle, barycentric, slope, pixel = (np.asarray(field)[index] for field in fields)
-    if not isinstance(index, slice):
-        triangle = np.where(index < 0, -1, triangle)
-    return PicturePoints(triangle, barycentric, slope, pixel // width, pixel % width)
+    return PicturePoints(np.where(index < 0, -1, triangle), barycentric, slope, pixel // width, pixel % width)
 
 
 def sky(

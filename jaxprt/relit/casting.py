@@ -41,7 +41,7 @@ class Caster:
 
     @cached_property
     def triangles(self) -> tuple[np.ndarray, ...]:
-        """The triangles as rays from pictures start from them."""
+        """The triangles, from `picture_rays.triangles`."""
         return picture_rays.triangles(self.mesh)
 
     @cached_property

@@ -525,8 +525,8 @@ class RelitScene(System):
             materials: As for `picture`.
             samples: As for `picture`.
             shadows: "rays" and "vertices" as in `picture`. With "rays", texels that earlier lights had in common are
-                not traced again. A light traces its brightest texels now, for all pictures of the view, also inside of
-                `jax.jit`; cells are then interpolated.
+                not traced again; cells are. A light traces its brightest texels now, for all pictures of the view, also
+                inside of `jax.jit`; its cells are interpolated.
         """
         return self._picture_view(camera, materials, samples=samples, keep=True, shadow=shadows, between=None)
 

@@ -108,7 +108,7 @@ def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, k
     if not len(bright):
         return None
     whole = np.sum(np.asarray(environment.radiance, np.float64).sum(-1) * np.asarray(cubemap.solid_angle(size=size)))
-    count = np.clip(1 + np.round(_MORE * flux[bright] / whole).astype(int), 1, picture_rays.PLACES)
+    count = _counts(_MORE * flux[bright] / whole)
     fine = _finer(environment)
     direction = light_samples.in_texels(number[bright], fine, size=size, count=picture_rays.PLACES)
     share = np.zeros((len(number), len(pixels.triangle)), np.uint8)
@@ -127,7 +127,7 @@ class CellLight(NamedTuple):
         width: Width of the picture in drawn pixels.
         number: Number of texels and cells.
         chosen: Indices of those that bring light.
-        seen: Their shares at the vertices of the group.
+        seen: Their visible shares at the vertices of the group, in 240ths.
         rays: Rays to even places in them.
     """
 
@@ -140,7 +140,7 @@ class CellLight(NamedTuple):
     rays: picture_rays.TexelRays
 
     def row(self, index: Int[np.ndarray, " p"]) -> UInt8[Array, "t p"]:
-        """What some points of the group see, by rays where the corners of a triangle see different shares.
+        """Visible shares at some points of the group, in 240ths, by rays where the corners of a triangle differ.
 
         Args:
             index: Indices of the points; -1 in padding.
@@ -166,8 +166,13 @@ def _rays_to(light: BrightLight, squares: Sequence[Squares]) -> tuple[np.ndarray
             used.append(here)
         first += count
     power = np.abs(np.concatenate(flux))
-    count = np.clip(1 + np.round(_CELL_RAYS * power / power.sum()).astype(int), 1, picture_rays.PLACES)
+    count = _counts(_CELL_RAYS * power / power.sum())
     return np.concatenate(used), picture_rays.TexelRays(np.concatenate(direction), count)
+
+
+def _counts(more: Float[np.ndarray, " t"]) -> Int[np.ndarray, " t"]:
+    """Numbers of rays to texels or cells: one each, and more of them."""
+    return np.clip(1 + np.round(more).astype(int), 1, picture_rays.PLACES)
 
 
 def cells(stage: Stage, pixels: Pixels, width: int, direct: Sequence[Any]) -> Iterator[CellLight | None]:
@@ -217,7 +222,8 @@ def _finer(light: Environment) -> Float[np.ndarray, "6 m m c"]:
 
 def _cast(mesh: Mesh, pixels: Pixels, width: int, rays: picture_rays.TexelRays) -> UInt8[np.ndarray, "t p"]:
     cast = caster(mesh)
-    return picture_rays.shares(cast.triangles, cast.occluder, canvas.traced(pixels, width, slice(None)), rays)
+    points = canvas.traced(pixels, width, np.arange(len(pixels.triangle)))
+    return picture_rays.shares(cast.triangles, cast.occluder, points, rays)
 
 
 # For each view, the traced texels: number of rays, a direction of each, and the shares.

@@ -85,7 +85,7 @@ class BrightLight(eqx.Module):
             ideally diffuse surfaces.
         flux: Vector irradiance / pi of every vertex by all of these texels, and then its irradiance / pi, for ideally
             diffuse surfaces; None before `BrightTexels.shade`, and for others.
-        here: Visible shares at the points of a view alone, in place of `seen`; None to interpolate.
+        here: Visible shares at the points of one view, in 240ths, in place of `seen`; None to interpolate that.
     """
 
     rest: PyTree

@@ -70,7 +70,7 @@ class TexelRays(NamedTuple):
 
 
 def triangles(mesh: Mesh) -> tuple[np.ndarray, ...]:
-    """The triangles of a mesh, on which points lie, as loops take them."""
+    """Triangles for points of a picture: positions and normals of vertices, corners, and how far off rays start."""
     position, face = np.asarray(mesh.position, np.float32), np.ascontiguousarray(mesh.face, np.int32)
     return position, np.asarray(mesh.normal, np.float32), face, offsets(position, face)
 
