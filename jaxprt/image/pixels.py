@@ -1,7 +1,8 @@
 """Anti-aliased pictures of meshes: shading points, interpolation, and resolving to pixels.
 
 As in multisample anti-aliasing, coverage is measured at all samples of a pixel, but radiance at only one point for each
-surface that the pixel shows.
+surface that the pixel shows. Where it varies within a pixel, it is measured at each sample, or at four points in place
+of each, which rays find.
 
 Opaque surfaces are rasterized. Rays through the samples collect the surfaces with an opacity in front of them. Each
 sample then sees a list of surfaces, from front to back, of which each hides the share `opacity` of the next ones. Glass
@@ -67,8 +68,9 @@ def shading_points(
     mesh: Mesh,
     camera: Camera,
     *,
-    uneven: Bool[Array, " f"] | None = None,
+    detail: UInt8[Array, " f"] | None = None,
     share: Float[Array, "h w s *c"] | None = None,
+    occluder: Occluder | None = None,
 ) -> Pixels:
     """Finds one shading point for each pixel and each surface that the pixel shows.
 
@@ -86,10 +88,12 @@ def shading_points(
         fragments: The result of `rasterize`.
         mesh: The rasterized mesh.
         camera: The camera of the rasterization.
-        uneven: Mask of triangles whose radiance varies so much within a pixel that each sample becomes a point; none if
-            None.
+        detail: How much the radiance of each triangle varies within a pixel: 0 if one point is enough for a surface, 1
+            if each sample becomes a point, 2 if each becomes four; 0 for all if None.
         share: Share from 0 to 1 of each sample that sees its triangle, or the background; all of it if None. Coverage
             and background count it.
+        occluder: The triangles, to find four points of a sample by rays. Without it, or inside of `jax.jit`, samples
+            remain one point.
 
     Raises:
         ValueError: The fragments are of a picture of another size, or refer to triangles that the mesh does not have.
@@ -105,7 +109,7 @@ def shading_points(
         raise ValueError(f"the fragments must refer to the mesh's {len(mesh.face)} triangles, got triangle {highest}")
     projected, block = _project(mesh, camera), min(BLOCK, 1 << (shape[0] * shape[1] - 1).bit_length())
     facing = raster.front_faces(mesh, camera)
-    uneven = jnp.zeros(len(mesh.face), bool) if uneven is None else uneven
+    uneven = jnp.zeros(len(mesh.face), bool) if detail is None else detail > 0
     members, mixed, background = _uniform(fragments, facing, uneven)
     if len(shape) == 3:
         face = facing, *_faces(mesh, projected), uneven
@@ -113,6 +117,21 @@ def shading_points(
             shown, samples = _samples(row, fragments, face)
             members = _merge(row, members, shown, _same(samples))
     parts = []
+    if detail is not None and len(shape) == 3 and occluder is not None and known(detail, members):
+        members, divided = _divided(members, fragments, np.asarray(detail), share)
+        for first in range(0, len(divided), block // 4):
+            sample = np.repeat(divided[first : first + block // 4], 4)
+            triangle, place = _places(sample, fragments, mesh, camera, np.asarray(facing), occluder)
+            room = (0, block - len(sample))
+            triangle, pixel = (
+                np.pad(triangle, room, constant_values=-1),
+                np.pad(sample // 4, room, mode="edge").astype(np.int32),
+            )
+            linear = _linear(*_corners(triangle, *np.pad(place, ((0, 0), room)), mesh.face, projected))
+            weight, rate = _weights(*linear, *np.zeros((2, block), projected.dtype))
+            coverage = np.zeros((block, *(() if share is None else share.shape[3:])), projected.dtype)
+            coverage[: len(sample)] = 1 / 16
+            parts.append((triangle, *_pack(triangle, weight, rate, *linear[1:]), pixel, coverage))
     for sample in _numbers(members.ravel(), block):
         triangle, pixel, coverage, corner, step = _points(sample, members, fragments, mesh.face, projected)
         if share is not None:
@@ -250,15 +269,16 @@ def _numbers(flag: Bool[Array, " n"] | UInt8[Array, " n"], block: int) -> list[I
     return [jax.device_put(row) for row in number.reshape(-1, block)]
 
 
-def _concatenate(parts: list[tuple[Array, ...]]) -> list[Array | np.ndarray]:
+def _concatenate(parts: list[tuple[Array | np.ndarray, ...]]) -> list[Array | np.ndarray]:
     """Concatenated fields of all parts; outside of jax.jit in NumPy, and without most of the padding."""
     if isinstance(parts[0][0], Tracer):
         return list(parts[0])
     count = sum(int(np.count_nonzero(np.asarray(part[0]) >= 0)) for part in parts)
     unit = 1 << max(count.bit_length() - 4, 0)
     room = max(-(-count // unit) * unit, 1)
-    field = (np.concatenate([np.asarray(values) for values in same]) for same in zip(*parts, strict=True))
-    return [values[:room] for values in field]
+    field = [np.concatenate([np.asarray(values) for values in same]) for same in zip(*parts, strict=True)]
+    order = np.argsort(np.where(field[0] < 0, np.iinfo(np.int32).max, field[3]), kind="stable")[:room]
+    return [values[order] for values in field]
 
 
 # The following is split into several programs, because XLA would fuse all computations of one program into each of its
@@ -361,12 +381,55 @@ def _points(
     member = jnp.where(used, members.ravel()[sample], 0)
     middle, coverage = (jnp.asarray(table, dtype)[member] for table in _subsets(samples))
     start = jnp.asarray(SAMPLES[samples], dtype)[sample % samples]
-    vertex = face[jnp.maximum(triangle, 0)].T
-    x, y, q = jax.lax.map(lambda axis: axis[vertex], projected)
     column = (pixel % width).astype(dtype) + (1 - width) / 2 + start[:, 0]
     row = (pixel // width).astype(dtype) + (1 - height) / 2 + start[:, 1]
-    s, step = jnp.sign(q), (middle - start).T
-    return triangle, pixel, coverage, (x - s * column, y - s * row, q), (step[0], step[1])
+    step = (middle - start).T
+    return triangle, pixel, coverage, _corners(triangle, column, row, face, projected), (step[0], step[1])
+
+
+@jit
+def _corners(triangle: Int[Array, " p"], column, row, face: Int[Array, "f 3"], projected: Float[Array, "3 v"]):
+    """Vertices of triangles relative to places in the picture, which are given from its middle."""
+    vertex = face[jnp.maximum(triangle, 0)].T
+    x, y, q = jax.lax.map(lambda axis: axis[vertex], projected)
+    s = jnp.sign(q)
+    return x - s * column, y - s * row, q
+
+
+def _divided(
+    members: UInt8[Array, "n 4"], fragments: Fragments, detail: UInt8[np.ndarray, " f"], share: Array | None
+) -> tuple[UInt8[Array, "n 4"], Int[np.ndarray, " m"]]:
+    """Member masks without samples that become four points, and indices of these: of at most half of the pixels."""
+    member, triangle = np.array(members), np.asarray(fragments.triangle).reshape(members.shape)
+    here = np.where(member > 0, detail[triangle], 0)
+    if share is not None:
+        here = np.where(np.all(np.asarray(share).reshape(*here.shape, -1) == 1, -1), here, 0)
+    # All samples of a pixel or none: their distances from the middles of their quarters cancel.
+    pixel, most = np.flatnonzero(np.any(here > 1, 1)), len(here) // 2
+    if len(pixel) > most:
+        pixel = pixel[np.arange(most) * len(pixel) // most]
+    row, place = np.nonzero(here[pixel] > 0)
+    member[pixel[row], place] = 0
+    return jnp.asarray(member), 4 * pixel[row] + place
+
+
+def _places(
+    sample: Int[np.ndarray, " p"],
+    fragments: Fragments,
+    mesh: Mesh,
+    camera: Camera,
+    facing: Bool[np.ndarray, " f"],
+    occluder: Occluder,
+) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, "2 p"]]:
+    """Triangles and places of four points of each sample; it is one itself where no ray hits a front of its surface."""
+    middle, offset = _pixel_middles(camera, sample // 4), SAMPLES[4][sample % 4]
+    finer = np.sign(offset) / 4 + SAMPLES[4][np.arange(len(sample)) % 4] / 2
+    origin = np.tile(np.asarray(camera.eye, np.float32), (len(sample), 1))
+    hit = occluder.facing_hit(origin, _directions(camera, middle + finer))[0]
+    triangle, region = np.asarray(fragments.triangle).ravel()[sample], np.asarray(mesh.region)[mesh.face[:, 0]]
+    same = (hit >= 0) & facing[hit] & (region[hit] == region[triangle])
+    place = middle + np.where(same[:, None], finer, offset)
+    return np.where(same, hit, triangle).astype(np.int32), place.T.astype(np.float32)
 
 
 @jit
@@ -441,7 +504,7 @@ def visible_points(
     samples: int,
     hidden: Bool[np.ndarray, " _"] | None = None,
     occluder: Occluder | None = None,
-    uneven: Bool[Array, " f"] | None = None,
+    detail: UInt8[Array, " f"] | None = None,
     between: Between = None,
 ) -> Pixels:
     """The shading points of a picture, and how much each adds to its pixel.
@@ -454,20 +517,20 @@ def visible_points(
         camera: The camera, in the coordinates of the mesh.
         samples: Samples of each pixel, 1 or 4.
         hidden: Triangles that cameras do not see from behind, without padding of the mesh; none if None.
-        occluder: The same triangles with their opacity; None if all of them are opaque.
-        uneven: Triangles of which each sample becomes a point; see `pixels.shading_points`.
+        occluder: The same triangles with their opacity; None if all of them are opaque and none has a `detail` of 2.
+        detail: How much the radiance of each triangle varies within a pixel; see `shading_points`.
         between: Function that is called between steps of the work.
     """
     if occluder is None or occluder.opacity is None:
         shown = seen_from_front(mesh, camera, hidden)
         fragments = finished(raster.rasterize(shown, camera, samples=samples), between)
-        return finished(shading_points(fragments, mesh, camera, uneven=uneven), between)
+        return finished(shading_points(fragments, mesh, camera, detail=detail, occluder=occluder), between)
     slots = _slots(mesh, camera, samples, hidden, occluder, occluder.opacity)
     result = []
     for triangle, depth, share in slots:
         triangle, depth = (values[..., 0] if samples == 1 else values for values in (triangle, depth))
         fragments = Fragments(jnp.asarray(triangle), None, jnp.asarray(depth))
-        points = shading_points(fragments, mesh, camera, uneven=uneven, share=jnp.asarray(share))
+        points = shading_points(fragments, mesh, camera, detail=detail, share=jnp.asarray(share), occluder=occluder)
         result.append(finished(points, between))
     return _join_points(result)
 
@@ -554,7 +617,8 @@ def _slots(
     chunks = []
     for first in range(0, len(behind[0]), _RAYS):
         span = slice(first, first + _RAYS)
-        direction = _directions(camera, samples, np.arange(len(behind[0]))[span])
+        pixel, number = np.divmod(np.arange(len(behind[0]))[span], samples)
+        direction = _directions(camera, _pixel_middles(camera, pixel) + SAMPLES[samples][number])
         far = np.minimum(behind[1][span], 1e30).astype(np.float32)
         eye = np.asarray(camera.eye, np.float32)
         number, face, place, alpha = occluder.translucent.layers(eye, direction, far, away[:count])
@@ -597,16 +661,17 @@ def _chunk(count, face, place, cover, through, triangle, depth) -> tuple[np.ndar
     return triangles.T[:used], depths.T[:used], np.swapaxes(shares, 0, 1)[:used]
 
 
-def _directions(camera: Camera, samples: int, number: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """Directions from the eye through samples, as long as one unit along the view axis."""
-    pixel, sample = np.divmod(number, samples)
-    row, column = np.divmod(pixel, camera.width)
-    offset = SAMPLES[samples][sample]
-    focal = camera.height / (2 * np.tan(float(camera.field_of_view) / 2))
-    x = (column + (1 - camera.width) / 2 + offset[:, 0]) / focal
-    y = (row + (1 - camera.height) / 2 + offset[:, 1]) / focal
+def _directions(camera: Camera, place: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    """Directions from the eye through places in pixels from the middle of the picture, one unit along the view axis."""
+    x, y = place.T * (2 * np.tan(float(camera.field_of_view) / 2) / camera.height)
     right, up, forward = np.asarray(raster.view_axes(camera), np.float64)
     return (x[:, None] * right - y[:, None] * up + forward).astype(np.float32)
+
+
+def _pixel_middles(camera: Camera, pixel: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
+    """Middles of pixels from the middle of the picture."""
+    row, column = np.divmod(pixel, camera.width)
+    return np.stack([column + (1 - camera.width) / 2, row + (1 - camera.height) / 2], 1)
 
 
 def _join_points(layers: list[Pixels]) -> Pixels:

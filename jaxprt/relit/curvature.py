@@ -8,7 +8,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float, UInt8
 
 from jaxprt.brdf import grid
 from jaxprt.compile import jit
@@ -21,7 +21,8 @@ from jaxprt.systems.protocol import System
 _DEGREE = 128  # degree of the harmonics that represent BRDFs
 _RINGS, _SECTORS = 96, 64
 _VIEW = np.array([0.6, 0.0, 0.8], np.float32)
-_WITHIN = 24 * 0.02  # allowed relative difference of a pixel's mean from its center, times 24
+# Allowed relative difference of a pixel's mean from its center, times 24, with one point, and with one for each sample.
+_WITHIN, _WITHIN_SAMPLES = 24 * 0.005, 24 * 0.16
 _RIM = 0.15  # allowed change of the cosine within a pixel, relative to the cosine plus this
 _MATTE = 0.83  # curvature up to which a surface counts as diffuse
 _EDGE_ON = 1e-6  # smallest area of a projected triangle in square pixels
@@ -65,8 +66,8 @@ def of_part(shading: Shading, system: System) -> float:
 
 
 @jit
-def uneven(mesh: Mesh, camera: Camera, curvature: Float[Array, " v"]) -> Bool[Array, " f"]:
-    """Triangles whose radiance varies too much within a pixel to be shaded at one point of it.
+def detail(mesh: Mesh, camera: Camera, curvature: Float[Array, " v"]) -> UInt8[Array, " f"]:
+    """How much the radiance of each triangle varies within a pixel, as `jaxprt.image.pixels.shading_points` takes it.
 
     The mean over a pixel differs from the value at its center by 1/24 of the Laplacian; the first criterion limits this
     for the change of the mirror direction. Near the silhouette of a glossy surface, radiance follows the cosine of the
@@ -96,8 +97,8 @@ def uneven(mesh: Mesh, camera: Camera, curvature: Float[Array, " v"]) -> Bool[Ar
         below = (other * first[0][:, None] - one * second[0][:, None]) * scale[:, None]
         return jnp.sum(right**2 + below**2, -1)
 
-    wide = square(mirror) * curvature[a] > _WITHIN
+    change = square(mirror) * curvature[a]
     mean = jnp.maximum((cosine[a] + cosine[b] + cosine[c]) / 3, 0)
     # Diffuse radiance does not depend on the view.
     rim = (square(cosine) > (_RIM * (mean + _RIM)) ** 2) & (curvature[a] > _MATTE)
-    return wide | rim
+    return jnp.where(change > _WITHIN_SAMPLES, 2, (change > _WITHIN) | rim).astype(jnp.uint8)

@@ -103,14 +103,17 @@ def _mean(image: Float[Array, "h w c"], fold: int) -> Float[Array, "_ _ c"]:
 
 
 def _nearest(stage: Stage, pixels: Pixels, camera: Camera, names: Sequence[str], *, fold: int) -> dict[str, Any]:
-    """Depth, position and part of the surface that covers most of each pixel."""
+    """Depth, position and part of the surface that covers most of each pixel, by a point of the part that does."""
     height, width = camera.height, camera.width
     rows, columns = height // fold, width // fold
     triangle, coverage = np.asarray(pixels.triangle), np.asarray(_gray(pixels).coverage)
     real = np.flatnonzero((triangle >= 0) & (coverage > _SHARE))
     at = np.asarray(pixels.pixel)[real]
     at = at // width // fold * columns + at % width // fold
-    real, at = (array[np.argsort(coverage[real], kind="stable")] for array in (real, at))
+    part = stage.part[stage.face[triangle[real], 0]].astype(np.int64)
+    _, same = np.unique(at * len(stage.layout.counts) + part, return_inverse=True)
+    order = np.lexsort([coverage[real], np.bincount(same, coverage[real])[same]])
+    real, at = real[order], at[order]
     point = np.full(rows * columns, -1)
     point[at] = real  # of equal indices the last one is written
     seen, chosen = point >= 0, np.maximum(point, 0)

@@ -38,6 +38,7 @@ _TAKEN = ("rest", "background", *outputs.LAYERS)  # names that regions cannot ha
 _ROUNDED = 1e-4  # of sums of shares
 # Samples that are drawn in each drawn pixel, and edge in drawn pixels of a pixel, by samples of a pixel.
 SAMPLES = {1: (1, 1), 4: (4, 1), 16: (4, 2)}
+_LITTLE = 1 / 8  # coverage below which a point casts a quarter of the reflection rays
 
 
 class Row(eqx.Module):
@@ -477,7 +478,8 @@ def make(
             if row.group in sharp:
                 blend, tilted = stage.blend(row.group, points, on_group)
                 narrow = stage.sharp_at(row.group, points)
-                origins.append(tracing.RayOrigins(row.group, points, tilted, blend, narrow, transport))
+                turn = _turn(pixels, index)
+                origins.append(tracing.RayOrigins(row.group, points, tilted, blend, narrow, transport, turn))
         complete.append(row)
     reflected = tracing.trace(stage, origins, jnp.asarray(camera.eye), keep=keep) if origins else None
     ray = raster.ray_direction(camera)
@@ -492,6 +494,15 @@ def make(
     more |= {"light_size": scene.light_size, "light_step": scene.light_step}
     arriving = eqx.Partial(scene.arriving, stage)
     return PictureView(stage, arriving, camera, pixels, ray, tuple(complete), reflected, fold, way, keep, **more)
+
+
+def _turn(pixels: Pixels, index: Any) -> Int[np.ndarray, " p"] | None:
+    """Which of each four reflection rays points cast that cover little of a pixel, -1 for others; None without such."""
+    if not known(pixels, index):
+        return None
+    coverage = np.asarray(pixels.coverage)[index].reshape(len(index), -1).max(1)
+    few = (coverage < _LITTLE) & (index >= 0)
+    return np.where(few, np.cumsum(few) % 4, -1) if few.any() else None
 
 
 def drawn(camera: Camera, samples: int) -> tuple[int, Camera, int]:
@@ -528,9 +539,10 @@ def _folded(picture: Float[Array, "h w c"], *, fold: int) -> Float[Array, "_ _ c
 
 def _placed(stage: Stage, camera: Camera, samples: int, between: Between) -> tuple[Pixels, list[Row]]:
     """The points of a picture in rows that are shaded alike."""
-    uneven = curvature.uneven(stage.mesh, camera, stage.bend)
-    occluder = None if stage.whole.opacity is None else caster(stage.whole).occluder
-    shown = {"hidden": stage.hidden_faces, "occluder": occluder, "uneven": uneven, "between": between}
+    detail = curvature.detail(stage.mesh, camera, stage.bend)
+    rays = stage.whole.opacity is not None or (samples > 1 and known(detail) and np.any(np.asarray(detail) > 1))
+    occluder = caster(stage.whole).occluder if rays else None
+    shown = {"hidden": stage.hidden_faces, "occluder": occluder, "detail": detail, "between": between}
     pixels = visible_points(stage.mesh, camera, samples=samples, **shown)
     if not known(pixels, stage.mesh):
         return pixels, list(_traced_rows(stage, pixels))

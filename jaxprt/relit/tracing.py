@@ -30,6 +30,7 @@ from jaxprt.relit.surface import Viewed, radiance, view
 from jaxprt.scene import Mesh
 from jaxprt.scene.points import Points
 from jaxprt.systems.bounces import ReflectingPart
+from jaxprt.systems.bounces.traced import ReflectionRays
 from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.lamps.relight import ray_share
 from jaxprt.systems.protocol import Blend
@@ -47,6 +48,7 @@ class RayOrigins(eqx.Module):
         blend: Material weights of the vertices or points.
         share: 1 where narrow lobes are traced, 0 elsewhere; None for 1 everywhere.
         lamps: The transport of the lamps to the points; None to interpolate it between vertices.
+        turn: Which of each four rays a point casts; -1 for all of them. None if all points cast all.
     """
 
     group: int = eqx.field(static=True)
@@ -55,6 +57,7 @@ class RayOrigins(eqx.Module):
     blend: Blend | None
     share: Float[Array, " v"] | None
     lamps: LampTransport | None = None
+    turn: Int[np.ndarray, " v"] | None = None
 
     @property
     def parameter(self) -> tuple[Float[Array, " v"], ...]:
@@ -146,6 +149,7 @@ def trace(stage: Stage, origins: Sequence[RayOrigins], eye: Float[Array, "3"], *
     for origin in origins:
         with jax.ensure_compile_time_eval():
             bundle = _reflecting(stage, origin).rays(eye, origin.parameter, origin.on_group, origin.share)
+            bundle = bundle if origin.turn is None else _shared(bundle, origin.turn)
             hit = cast.cast(bundle, origin.points, at_vertices=origin.on_group.all_vertices)
             hits.append((*hit, cast.spread(bundle, *hit)))
             rays.append(bundle)
@@ -156,6 +160,13 @@ def trace(stage: Stage, origins: Sequence[RayOrigins], eye: Float[Array, "3"], *
         part = np.where(triangle >= 0, stage.part[cast.face[triangle, 0]], -1)
         paths.append(PathWeights(slot, weight, _lamps(stage, origin, part, weight, bundle.concentration)))
     return Reflections(tuple(paths), rows)
+
+
+def _shared(rays: ReflectionRays, turn: Int[np.ndarray, " v"]) -> ReflectionRays:
+    """The rays without those that other points cast."""
+    several = min(4, len(rays.chance))
+    other = (turn >= 0) & (np.arange(len(rays.chance))[:, None] % several != turn % several)
+    return dataclasses.replace(rays, chance=put(np.where(other, 0, np.asarray(rays.chance))))
 
 
 def _reflecting(stage: Stage, origin: RayOrigins) -> ReflectingPart:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy
 import trimesh
 
 from jaxprt.image import interpolate, pixels, raster, resolve
@@ -424,6 +425,32 @@ def drawn(*pairs, samples=4, hidden=()):
     return np.asarray(resolve(pixels, interpolate(pixels, mesh.face, color[region]), background=background))
 
 
+def test_four_points_of_a_sample_are_the_samples_of_a_picture_of_twice_the_size():
+    ball, wall = _ball(), _mesh([[-3, -3, -2], [3, -3, -2], [3, 3, -2]], [[0, 1, 2]], region=1)
+    mesh, eye = join([ball, wall]), (0, 0.3, 2)
+    camera, twice = _camera(eye), _camera(eye, width=64, height=48)
+    color = np.random.default_rng(0).uniform(size=(len(mesh.position), 3)).astype(np.float32)
+    color[np.asarray(mesh.region) == 1] = 0
+
+    def picture(camera, detail, occluder=None):
+        detail = jnp.where(mesh.region[mesh.face[:, 0]] == 0, detail, 1).astype(jnp.uint8)
+        points = visible_points(mesh, camera, samples=4, occluder=occluder, detail=detail)
+        return points, np.asarray(resolve(points, interpolate(points, mesh.face, jnp.asarray(color))))
+
+    (points, four), (_, one) = picture(camera, 2, Occluder(mesh)), picture(camera, 1)
+    finer = picture(twice, 1)[1].reshape(24, 2, 32, 2, 3).mean((1, 3))
+    on_ball = (mesh.region == 0).astype(jnp.float32)[:, None]
+    inside = np.asarray(resolve(points, interpolate(points, mesh.face, on_ball)))[..., 0] > 1 - 1e-4
+    inside = scipy.ndimage.binary_erosion(inside)
+    assert inside.sum() > 50
+    np.testing.assert_allclose(four[inside], finer[inside], atol=1e-4)
+    assert np.abs(one - finer)[inside].max() > 5e-3
+    assert np.all(np.diff(points.pixel[points.triangle >= 0]) >= 0)
+    # As much of each surface as with one point a sample, also where rays beside the ball hit the wall or nothing.
+    whole = [resolve(each, jnp.ones((len(each.triangle), 1))) for each in (points, picture(camera, 1)[0])]
+    np.testing.assert_allclose(*whole, atol=1e-6)
+
+
 PLAIN = TexturedMaterial()
 
 
@@ -434,6 +461,26 @@ def test_a_hole_by_alpha_shows_what_a_hole_in_the_mesh_shows(samples):
     cut = drawn((sheet(0.5, (0.0, 1.0)), PLAIN), (sheet(0.0), PLAIN), samples=samples)
     np.testing.assert_allclose(by_alpha, cut, atol=1e-6)
     assert cut[..., 0].max() > 0.99
+
+
+def test_samples_behind_translucent_surfaces_stay_one_point():
+    glass = Part("glass", sheet(0.5, (0.0, 1.0)), TexturedMaterial(alpha=0.3, alpha_mode="blend"))
+    mesh = Scene([glass, Part("wall", sheet(0.0), PLAIN)]).mesh
+    detail = jnp.full(len(mesh.face), 2, jnp.uint8)
+    points = visible_points(mesh, CAMERA, samples=4, occluder=Occluder(mesh), detail=detail)
+    left, right = (np.flatnonzero(points.pixel == 16 * CAMERA.width + column) for column in (10, 20))
+    np.testing.assert_array_equal(points.coverage[left], np.full(16, 1 / 16))
+    np.testing.assert_allclose(points.coverage[right], [0.3 / 4] * 4 + [0.7 / 4] * 4, atol=1e-6)
+
+
+def test_samples_become_four_points_in_at_most_half_of_the_pixels():
+    mesh = Scene([Part("wall", sheet(0.0, (-9.0, 9.0)), PLAIN)]).mesh
+    camera = Camera((0.0, 0, 0.5), (0.0, 0, 0), (0.0, 1, 0), 0.9, 33, 32)
+    detail = jnp.full(len(mesh.face), 2, jnp.uint8)
+    points = visible_points(mesh, camera, samples=4, occluder=Occluder(mesh), detail=detail)
+    assert np.count_nonzero(points.triangle >= 0) == 33 * 32 * (16 + 4) / 2
+    sums = np.bincount(points.pixel, points.coverage)
+    np.testing.assert_allclose(sums, 1, atol=1e-6)
 
 
 def test_translucent_surfaces_are_composited_from_front_to_back():

@@ -13,7 +13,7 @@ import pytest
 
 import jaxprt as prt
 from jaxprt import bounces, lobe
-from jaxprt.relit import Lobes, RelitScene, casting, tracing
+from jaxprt.relit import Lobes, RelitScene, casting, curvature, tracing
 from jaxprt.scene import Camera, Environment, Mesh, Part, Scene, TexturedMaterial, builtin
 from jaxprt.scene.mesh import make_mesh
 from jaxprt.scene.points import on_triangles
@@ -137,6 +137,15 @@ def test_points_batches_and_programs_agree_with_the_vertices(close):
     assert np.isfinite(jax.jit(lambda eye: ready.with_rays(0).radiance(light(), eye=eye))(EYE)).all()
 
 
+def mirrored_by_pixels() -> np.ndarray:
+    """How far inside of the wall what pixels of the floor mirror is; 0 for other pixels."""
+    rays = np.asarray(prt.image.raster.ray_direction(CAMERA)).reshape(-1, 3)
+    with np.errstate(divide="ignore"):
+        place = np.asarray(EYE) + rays * (-EYE[1] / rays[:, 1])[:, None]
+    on_floor = (rays[:, 1] < -0.1) & (np.abs(place[:, 0]) < 1.4) & (np.abs(place[:, 2] - 0.5) < 1.4)
+    return np.where(on_floor, mirrored(np.where(on_floor[:, None], place, 1.0)), 0)
+
+
 def test_a_kept_view_gives_the_picture_of_every_light_and_of_the_closed_form(close):
     ready = relit()
     view = ready.picture_view(CAMERA)
@@ -147,18 +156,30 @@ def test_a_kept_view_gives_the_picture_of_every_light_and_of_the_closed_form(clo
         ready.picture(light(), CAMERA, shadows="vertices"),
         tolerance=1e-4,
     )
-    dark = np.asarray(ready.picture(DARK, CAMERA))
-    rays = np.asarray(prt.image.raster.ray_direction(CAMERA)).reshape(-1, 3)
-    with np.errstate(divide="ignore"):
-        place = np.asarray(EYE) + rays * (-EYE[1] / rays[:, 1])[:, None]
-    on_floor = (rays[:, 1] < -0.1) & (np.abs(place[:, 0]) < 1.4) & (np.abs(place[:, 2] - 0.5) < 1.4)
-    inside = np.where(on_floor, mirrored(np.where(on_floor[:, None], place, 1.0)), 0)
-    shown = inside > 0.15
-    assert shown.sum() > 10
-    np.testing.assert_allclose(
-        dark.reshape(-1, 3)[shown], np.broadcast_to(ALBEDO * GLOW, (shown.sum(), 3)), rtol=COARSE
-    )
-    np.testing.assert_allclose(dark.reshape(-1, 3)[inside < -0.15], 0, atol=FAINT)
+    dark = np.asarray(ready.picture(DARK, CAMERA, samples=1)).reshape(-1, 3)
+    inside = mirrored_by_pixels()
+    assert (inside > 0.15).sum() > 10
+    np.testing.assert_allclose(dark[inside > 0.15] / (ALBEDO * GLOW), 1, rtol=COARSE)
+    np.testing.assert_allclose(dark[inside < -0.15], 0, atol=FAINT)
+
+
+def test_four_points_of_a_sample_share_its_rays(monkeypatch):
+    cast, count = casting.Caster.cast, []
+
+    def counted(self, rays, points, **options):
+        count.append(np.count_nonzero(rays.chance, axis=0))
+        return cast(self, rays, points, **options)
+
+    monkeypatch.setattr(casting.Caster, "cast", counted)
+    pictures = []
+    for detail in (1, 2):
+        monkeypatch.setattr(curvature, "detail", lambda mesh, *_, to=detail: jnp.full(len(mesh.face), to, jnp.uint8))
+        pictures.append(np.asarray(relit().picture(DARK, CAMERA)).reshape(-1, 3))
+    assert set(count[0]) == {8}
+    assert set(count[1]) == {2, 8}
+    assert np.count_nonzero(count[1] == 2) > 1000
+    inside = mirrored_by_pixels()
+    np.testing.assert_allclose(pictures[1][inside > 0.3] / (ALBEDO * GLOW), 1, rtol=COARSE)
 
 
 def test_light_is_linear_and_colors_have_the_gradient_of_finite_differences(close):
