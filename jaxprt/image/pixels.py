@@ -48,8 +48,8 @@ class Pixels(eqx.Module):
         barycentric: Perspective-correct barycentric coordinates, not negative. They sum to 1, or to 0 in padding.
         slope: Change of the barycentric coordinates per pixel to the right, and per pixel down.
         pixel: Index of each point's pixel, row * width + column.
-        coverage: Fraction of the pixel's samples that see the surface of the point, for each color if they see it
-            through glass; 0 in padding.
+        coverage: Fraction of the pixel that the point stands for, for each color if it is seen through glass; 0 in
+            padding.
         background: Fraction of each pixel's samples that see no triangle, for each color if they look through glass.
             The remaining samples see backs of surfaces, which are black.
     """
@@ -92,8 +92,8 @@ def shading_points(
             if each sample becomes a point, 2 if each becomes four; 0 for all if None.
         share: Share from 0 to 1 of each sample that sees its triangle, or the background; all of it if None. Coverage
             and background count it.
-        occluder: The triangles, to find four points of a sample by rays. Without it, or inside of `jax.jit`, samples
-            remain one point.
+        occluder: The triangles of the mesh in its coordinates, to find four points of a sample by rays. Without it, or
+            inside of `jax.jit`, samples remain one point.
 
     Raises:
         ValueError: The fragments are of a picture of another size, or refer to triangles that the mesh does not have.
@@ -118,19 +118,14 @@ def shading_points(
             members = _merge(row, members, shown, _same(samples))
     parts = []
     if detail is not None and len(shape) == 3 and occluder is not None and known(detail, members):
-        members, divided = _divided(members, fragments, np.asarray(detail), share)
-        for first in range(0, len(divided), block // 4):
-            sample = np.repeat(divided[first : first + block // 4], 4)
-            triangle, place = _places(sample, fragments, mesh, camera, np.asarray(facing), occluder)
+        members, *divided = _divided(members, fragments, np.asarray(detail), share, mesh, camera, facing, occluder)
+        for first in range(0, len(divided[0]), block):
+            sample, triangle, across, down = (values[first : first + block] for values in divided)
             room = (0, block - len(sample))
-            triangle, pixel = (
-                np.pad(triangle, room, constant_values=-1),
-                np.pad(sample // 4, room, mode="edge").astype(np.int32),
-            )
-            linear = _linear(*_corners(triangle, *np.pad(place, ((0, 0), room)), mesh.face, projected))
+            pixel, triangle = np.pad(sample // 4, room), np.pad(triangle, room, constant_values=-1)
+            linear = _linear(*_corners(triangle, np.pad(across, room), np.pad(down, room), mesh.face, projected))
             weight, rate = _weights(*linear, *np.zeros((2, block), projected.dtype))
-            coverage = np.zeros((block, *(() if share is None else share.shape[3:])), projected.dtype)
-            coverage[: len(sample)] = 1 / 16
+            coverage = np.full((block, *(() if share is None else share.shape[3:])), 1 / 16, projected.dtype)
             parts.append((triangle, *_pack(triangle, weight, rate, *linear[1:]), pixel, coverage))
     for sample in _numbers(members.ravel(), block):
         triangle, pixel, coverage, corner, step = _points(sample, members, fragments, mesh.face, projected)
@@ -139,7 +134,7 @@ def shading_points(
         linear = _linear(*corner)
         weight, rate = _weights(*linear, *step)
         parts.append((triangle, *_pack(triangle, weight, rate, *linear[1:]), pixel, coverage))
-    triangle, barycentric, slope, pixel, coverage = _concatenate(parts)
+    triangle, barycentric, slope, pixel, coverage = _joined(parts)
     if share is not None:
         background = _empty_share(fragments, share)
     return Pixels(triangle, barycentric, slope, pixel, coverage, background)
@@ -269,16 +264,21 @@ def _numbers(flag: Bool[Array, " n"] | UInt8[Array, " n"], block: int) -> list[I
     return [jax.device_put(row) for row in number.reshape(-1, block)]
 
 
-def _concatenate(parts: list[tuple[Array | np.ndarray, ...]]) -> list[Array | np.ndarray]:
-    """Concatenated fields of all parts; outside of jax.jit in NumPy, and without most of the padding."""
+def _joined(parts: list[tuple[Array | np.ndarray, ...]]) -> list[Array | np.ndarray]:
+    """Fields of all points; outside of jax.jit in NumPy, ordered by pixel, and with at most an eighth of padding."""
     if isinstance(parts[0][0], Tracer):
         return list(parts[0])
-    count = sum(int(np.count_nonzero(np.asarray(part[0]) >= 0)) for part in parts)
-    unit = 1 << max(count.bit_length() - 4, 0)
-    room = max(-(-count // unit) * unit, 1)
-    field = [np.concatenate([np.asarray(values) for values in same]) for same in zip(*parts, strict=True)]
-    order = np.argsort(np.where(field[0] < 0, np.iinfo(np.int32).max, field[3]), kind="stable")[:room]
-    return [values[order] for values in field]
+    fields = [np.concatenate([np.asarray(values) for values in same]) for same in zip(*parts, strict=True)]
+    triangle, _, _, pixel, _ = fields
+    used = np.flatnonzero(triangle >= 0)
+    order = used[np.argsort(pixel[used], kind="stable")]
+    unit = 1 << max(len(order).bit_length() - 4, 0)
+    room = max(-(-len(order) // unit) * unit, 1) - len(order)
+    padding = (
+        np.full((room, *values.shape[1:]), value, values.dtype)
+        for values, value in zip(fields, (-1, 0, 0, pixel.max(), 0), strict=True)
+    )
+    return [np.concatenate([values[order], rest]) for values, rest in zip(fields, padding, strict=True)]
 
 
 # The following is split into several programs, because XLA would fuse all computations of one program into each of its
@@ -397,39 +397,56 @@ def _corners(triangle: Int[Array, " p"], column, row, face: Int[Array, "f 3"], p
 
 
 def _divided(
-    members: UInt8[Array, "n 4"], fragments: Fragments, detail: UInt8[np.ndarray, " f"], share: Array | None
-) -> tuple[UInt8[Array, "n 4"], Int[np.ndarray, " m"]]:
-    """Member masks without samples that become four points, and indices of these: of at most half of the pixels."""
+    members: UInt8[Array, "n 4"],
+    fragments: Fragments,
+    detail: UInt8[np.ndarray, " f"],
+    share: Array | None,
+    mesh: Mesh,
+    camera: Camera,
+    facing: Bool[Array, " f"],
+    occluder: Occluder,
+) -> tuple[Any, ...]:
+    """Member masks without samples that become four points; and of each point its sample, triangle, column and row."""
     member, triangle = np.array(members), np.asarray(fragments.triangle).reshape(members.shape)
     here = np.where(member > 0, detail[triangle], 0)
     if share is not None:
         here = np.where(np.all(np.asarray(share).reshape(*here.shape, -1) == 1, -1), here, 0)
-    # All samples of a pixel or none: their distances from the middles of their quarters cancel.
-    pixel, most = np.flatnonzero(np.any(here > 1, 1)), len(here) // 2
-    if len(pixel) > most:
-        pixel = pixel[np.arange(most) * len(pixel) // most]
-    row, place = np.nonzero(here[pixel] > 0)
-    member[pixel[row], place] = 0
-    return jnp.asarray(member), 4 * pixel[row] + place
+    pixel = np.flatnonzero(np.any(here > 1, 1))
+    if len(pixel) > len(here) // 2:  # what is kept of a view holds a kilobyte for each point
+        pixel = pixel[(pixel // camera.width + pixel % camera.width) % 2 == 0]
+    # All single samples of a pixel or none: their distances from the middles of their quarters cancel.
+    row, number = np.nonzero(here[pixel] > 0)
+    sample = np.repeat((4 * pixel[row] + number).astype(np.int32), 4)
+    chunks = [sample[first : first + _RAYS] for first in range(0, len(sample), _RAYS)]
+    parts = [_places(chunk, triangle.ravel(), mesh, camera, np.asarray(facing), occluder) for chunk in chunks]
+    if not parts:
+        return members, sample, sample, *np.zeros((2, 0), np.float32)
+    triangle, place, same = (np.concatenate(values) for values in zip(*parts, strict=True))
+    # Pixels in which no ray finds a place, as behind backs that are hidden, keep their samples.
+    some = np.bincount(sample // 4, same) > 0
+    used = some[sample // 4]
+    member.reshape(-1)[sample[used]] = 0
+    return jnp.asarray(member), sample[used], triangle[used], *place[used].T
 
 
 def _places(
     sample: Int[np.ndarray, " p"],
-    fragments: Fragments,
+    triangle: Int[np.ndarray, " s"],
     mesh: Mesh,
     camera: Camera,
     facing: Bool[np.ndarray, " f"],
     occluder: Occluder,
-) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, "2 p"]]:
-    """Triangles and places of four points of each sample; it is one itself where no ray hits a front of its surface."""
-    middle, offset = _pixel_middles(camera, sample // 4), SAMPLES[4][sample % 4]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Triangles and places of four points of each sample, and whether rays found them; else a point is the sample."""
+    camera = jax.lax.stop_gradient(camera)
+    middle, offset, seen = _pixel_middles(camera, sample // 4), SAMPLES[4][sample % 4], triangle[sample]
     finer = np.sign(offset) / 4 + SAMPLES[4][np.arange(len(sample)) % 4] / 2
     origin = np.tile(np.asarray(camera.eye, np.float32), (len(sample), 1))
     hit = occluder.facing_hit(origin, _directions(camera, middle + finer))[0]
-    triangle, region = np.asarray(fragments.triangle).ravel()[sample], np.asarray(mesh.region)[mesh.face[:, 0]]
-    same = (hit >= 0) & facing[hit] & (region[hit] == region[triangle])
+    face, region = np.asarray(mesh.face), np.asarray(mesh.region)
+    same = (hit >= 0) & facing[hit] & (region[face[hit, 0]] == region[face[seen, 0]])
     place = middle + np.where(same[:, None], finer, offset)
-    return np.where(same, hit, triangle).astype(np.int32), place.T.astype(np.float32)
+    return np.where(same, hit, seen).astype(np.int32), place.astype(np.float32), same
 
 
 @jit
@@ -532,7 +549,8 @@ def visible_points(
         fragments = Fragments(jnp.asarray(triangle), None, jnp.asarray(depth))
         points = shading_points(fragments, mesh, camera, detail=detail, share=jnp.asarray(share), occluder=occluder)
         result.append(finished(points, between))
-    return _join_points(result)
+    parts = [(layer.triangle, layer.barycentric, layer.slope, layer.pixel, layer.coverage) for layer in result]
+    return Pixels(*_joined(parts), sum((layer.background for layer in result[1:]), result[0].background))
 
 
 def coverage(
@@ -672,24 +690,6 @@ def _pixel_middles(camera: Camera, pixel: Int[np.ndarray, " n"]) -> Float[np.nda
     """Middles of pixels from the middle of the picture."""
     row, column = np.divmod(pixel, camera.width)
     return np.stack([column + (1 - camera.width) / 2, row + (1 - camera.height) / 2], 1)
-
-
-def _join_points(layers: list[Pixels]) -> Pixels:
-    """The points of all layers, ordered by pixel, with at most an eighth of padding."""
-    fields = ("triangle", "barycentric", "slope", "pixel", "coverage")
-    whole = {name: np.concatenate([np.asarray(getattr(layer, name)) for layer in layers]) for name in fields}
-    used = np.flatnonzero(whole["triangle"] >= 0)
-    order = used[np.argsort(whole["pixel"][used], kind="stable")]
-    count = len(order)
-    unit = 1 << max(count.bit_length() - 4, 0)
-    room = max(-(-count // unit) * unit, 1) - count
-    height, width = layers[0].background.shape[:2]
-    value = {"triangle": -1, "pixel": height * width - 1}
-    rows = {
-        name: np.concatenate([field[order], np.full((room, *field.shape[1:]), value.get(name, 0), field.dtype)])
-        for name, field in whole.items()
-    }
-    return Pixels(**rows, background=sum((layer.background for layer in layers[1:]), layers[0].background))
 
 
 def sky(environment: Environment, camera: Camera) -> Float[Array, "h w c"]:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxprt import require
 from jaxprt.files.outputs import LAYERS
+from jaxprt.image import raster
 from jaxprt.image.pixels import Pixels
 from jaxprt.relit import canvas
 from jaxprt.relit.groups import Stage
@@ -103,31 +104,31 @@ def _mean(image: Float[Array, "h w c"], fold: int) -> Float[Array, "_ _ c"]:
 
 
 def _nearest(stage: Stage, pixels: Pixels, camera: Camera, names: Sequence[str], *, fold: int) -> dict[str, Any]:
-    """Depth, position and part of the surface that covers most of each pixel, by a point of the part that does."""
-    height, width = camera.height, camera.width
-    rows, columns = height // fold, width // fold
+    """The part that covers most of each pixel, and depth and position of its point nearest to the pixel's middle."""
+    width, rows, columns = camera.width, camera.height // fold, camera.width // fold
     triangle, coverage = np.asarray(pixels.triangle), np.asarray(_gray(pixels).coverage)
     real = np.flatnonzero((triangle >= 0) & (coverage > _SHARE))
-    at = np.asarray(pixels.pixel)[real]
+    at = np.asarray(pixels.pixel)[real].astype(np.int64)
     at = at // width // fold * columns + at % width // fold
-    part = stage.part[stage.face[triangle[real], 0]].astype(np.int64)
-    _, same = np.unique(at * len(stage.layout.counts) + part, return_inverse=True)
-    order = np.lexsort([coverage[real], np.bincount(same, coverage[real])[same]])
-    real, at = real[order], at[order]
-    point = np.full(rows * columns, -1)
-    point[at] = real  # of equal indices the last one is written
-    seen, chosen = point >= 0, np.maximum(point, 0)
-    corner = stage.face[np.maximum(triangle[chosen], 0)]
-    weight = np.asarray(pixels.barycentric)[chosen]
+    corner = stage.face[triangle[real]]
+    part = stage.part[corner[:, 0]]
+    weight = np.asarray(pixels.barycentric, np.float64)[real]
     position = np.einsum("pk,pkc->pc", weight, np.asarray(stage.whole.position)[corner])
-    result: dict[str, Any] = {}
+    way = position - np.asarray(camera.eye)
+    middle = raster.ray_direction(dataclasses.replace(camera, width=columns, height=rows)).reshape(-1, 3)
+    apart = np.linalg.norm(way / np.linalg.norm(way, axis=1, keepdims=True) - np.asarray(middle)[at], axis=1)
+    _, same = np.unique(at * len(stage.layout.counts) + part, return_inverse=True)
+    order = np.lexsort([-apart, np.bincount(same, coverage[real])[same]])
+    shown, place = np.full(rows * columns, -1, np.int32), np.zeros((rows * columns, 3))
+    shown[at[order]], place[at[order]] = part[order], position[order]  # of equal indices the last one is written
+    seen, result = shown >= 0, {}
     if "depth" in names:
         eye, target = np.asarray(camera.eye), np.asarray(camera.target)
         ahead = (target - eye) / np.linalg.norm(target - eye)
-        result["depth"] = np.where(seen, (position - eye) @ ahead, np.inf)
+        result["depth"] = np.where(seen, (place - eye) @ ahead, np.inf)
     if "part" in names:
-        result["part"] = np.where(seen, stage.part[corner[:, 0]], -1).astype(np.int32)
+        result["part"] = shown
     if "position" in names:
-        world = position + np.asarray(stage.whole.origin, position.dtype)
+        world = place + np.asarray(stage.whole.origin)
         result["position"] = np.where(seen[:, None], world, 0)
     return {name: jnp.asarray(value.reshape(rows, columns, -1)) for name, value in result.items()}

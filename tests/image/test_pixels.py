@@ -473,6 +473,23 @@ def test_samples_behind_translucent_surfaces_stay_one_point():
     np.testing.assert_allclose(points.coverage[right], [0.3 / 4] * 4 + [0.7 / 4] * 4, atol=1e-6)
 
 
+def test_samples_seen_through_hidden_backs_stay_one_point():
+    mesh = Scene([Part("back", sheet(0.5, turn=-1), PLAIN), Part("wall", sheet(0.0), PLAIN)]).mesh
+    detail = jnp.full(len(mesh.face), 2, jnp.uint8)
+    hidden = np.asarray(mesh.region)[np.asarray(mesh.face)[:, 0]] == 0
+    points = visible_points(mesh, CAMERA, samples=4, hidden=hidden, occluder=Occluder(mesh), detail=detail)
+    middle = np.flatnonzero(points.pixel == 16 * CAMERA.width + 16)
+    np.testing.assert_array_equal(points.coverage[middle], [1 / 4] * 4)
+
+
+def test_pictures_of_one_pixel_keep_its_samples():
+    mesh = Scene([Part("wall", sheet(0.0, (-9.0, 9.0)), PLAIN)]).mesh
+    camera = Camera((0.0, 0, 0.1), (0.0, 0, 0), (0.0, 1, 0), 0.1, 1, 1)
+    detail = jnp.full(len(mesh.face), 2, jnp.uint8)
+    points = visible_points(mesh, camera, samples=4, occluder=Occluder(mesh), detail=detail)
+    np.testing.assert_array_equal(points.coverage[points.triangle >= 0], [1 / 16] * 16)
+
+
 def test_samples_become_four_points_in_at_most_half_of_the_pixels():
     mesh = Scene([Part("wall", sheet(0.0, (-9.0, 9.0)), PLAIN)]).mesh
     camera = Camera((0.0, 0, 0.5), (0.0, 0, 0), (0.0, 1, 0), 0.9, 33, 32)

@@ -151,8 +151,9 @@ def test_pictures_go_through_programs_and_have_gradients(close):
     close(jnp.vdot(slope, light(2).radiance), np.vdot(weight, picture(light(2).radiance, CAMERA.eye)), tolerance=1e-4)
     turned = jax.jit(jax.vmap(picture, (None, 0)))(radiance, jnp.stack([CAMERA.eye, CAMERA.eye + 0.1]))
     close(turned[0], jitted, tolerance=1e-4)
-    bright = jax.jit(jax.grad(lambda eye: jnp.sum(picture(radiance, eye))))(CAMERA.eye)
-    assert np.isfinite(bright).all()
+    by_eye = jax.grad(lambda eye: jnp.sum(picture(radiance, eye)))
+    assert np.isfinite(jax.jit(by_eye)(CAMERA.eye)).all()
+    close(by_eye(CAMERA.eye), jax.jit(by_eye)(CAMERA.eye), tolerance=0.1)
     view = ready.picture_view(CAMERA, shadows=light())
     traced = jax.jit(lambda view, light: view.picture(light))(view, light())
     close(traced, view.picture(light()), tolerance=1e-4)
@@ -374,7 +375,7 @@ def test_geometric_layers_lie_on_the_rays_of_their_pixels():
     inside = ball & (length > 0.9)  # means over pixels that the ball fills
     assert np.count_nonzero(inside) > 10
     cosine = np.sum(layers["normal"] * outward, -1)[inside] / (length * np.linalg.norm(outward, axis=-1))[inside]
-    assert np.min(cosine) > 0.9
+    assert np.min(cosine) > 0.95
     assert np.median(cosine) > 0.98
 
 
