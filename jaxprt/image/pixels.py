@@ -550,7 +550,8 @@ def visible_points(
         points = shading_points(fragments, mesh, camera, detail=detail, share=jnp.asarray(share), occluder=occluder)
         result.append(finished(points, between))
     parts = [(layer.triangle, layer.barycentric, layer.slope, layer.pixel, layer.coverage) for layer in result]
-    return Pixels(*_joined(parts), sum((layer.background for layer in result[1:]), result[0].background))
+    background = functools.reduce(jnp.add, [layer.background for layer in result])
+    return Pixels(*_joined(parts), background=background)
 
 
 def coverage(
