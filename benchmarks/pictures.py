@@ -55,12 +55,22 @@ GOLD = [0.8, 0.6, 0.4]
 BRDFS = {
     "exponent 20": AshikhminShirley(diffuse=0.5, specular=0.25, nu=20, nv=20),
     "exponent 100": AshikhminShirley(diffuse=0.5, specular=0.25, nu=100, nv=100),
-    **{f"metal {alpha}": MetallicRoughness(GOLD, metallic=1.0, roughness=alpha**0.5) for alpha in (0.3, 0.1, 0.05)},
+    "plastic": MetallicRoughness(GOLD, metallic=0.0, roughness=0.4),
+    **{
+        f"metal {alpha}": MetallicRoughness(GOLD, metallic=1.0, roughness=alpha**0.5)
+        for alpha in (0.3, 0.1, 0.05, 0.0225)
+    },
 }
 LADDER = (
     *((mesh, light, "exponent 100") for mesh in MESHES for light in ("grace", "eucalyptus")),
     *(("spot", light, "exponent 100") for light in ("courtyard", "studio", "sunrise")),
-    *(("spot", "grace", name) for name in BRDFS if name != "exponent 100"),
+    *(("spot", "grace", name) for name in BRDFS if name not in ("exponent 100", "plastic")),
+    # Soft boxes, and highlights that change within a pixel.
+    *(("rocker arm", "studio", f"metal {alpha}") for alpha in (0.3, 0.1, 0.0225)),
+    ("bunny", "studio", "exponent 20"),
+    ("spot", "studio", "plastic"),
+    ("bunny", "sunrise", "metal 0.0225"),
+    ("rocker arm", "courtyard", "metal 0.0225"),
 )
 
 
