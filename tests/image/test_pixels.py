@@ -482,7 +482,7 @@ def test_samples_seen_through_hidden_backs_stay_one_point():
     np.testing.assert_array_equal(points.coverage[middle], [1 / 4] * 4)
 
 
-def test_pictures_of_one_pixel_keep_its_samples():
+def test_pictures_of_one_pixel_have_sixteen_points():
     mesh = Scene([Part("wall", sheet(0.0, (-9.0, 9.0)), PLAIN)]).mesh
     camera = Camera((0.0, 0, 0.1), (0.0, 0, 0), (0.0, 1, 0), 0.1, 1, 1)
     detail = jnp.full(len(mesh.face), 2, jnp.uint8)
