@@ -72,7 +72,8 @@ REASONS = {
     "NumPy, or values or types that are looked at, on the host": """
         inverse scene.texture.unit_normals scene.sides image.pixels.sky image.pixels.pixel_angle systems.axes
         systems.ranges systems.lobe.system.matte_transport systems.lobe.pyramid.compress systems.lobe.pyramid.dither
-        systems.lamps.places systems.bounces.traced.is_sharp systems.bounces.traced.is_traced visibility.members.cluster
+        systems.lamps.places systems.lamps.outline.of_lamps systems.bounces.traced.is_sharp
+        systems.bounces.traced.is_traced visibility.members.cluster
         visibility.members.coordinates systems.bright_texels.samples_for decompose.clustering
         decompose.eigen.orientation decompose.tucker.orient systems.separable.factorization.mark_of
         systems.dynamic.reflected.stacked systems.bounces.gather.shares systems.bounces.gather.cosines
@@ -273,6 +274,12 @@ class Draw:
         """Transport of two lamps, the first of two pieces."""
         moment = self.uniform(3, vertices), self.uniform(3, vertices), self.normal(3, 3, vertices)
         return LampTransport(*moment, self.normal(vertices, 3), self.rotation(vertices), (0, 0, 1))
+
+    def polygon(self, vertices=4):
+        """Directions to corners of a square that nothing looks along, for each vertex."""
+        corner = np.array([[-0.6, -0.5, 1], [0.5, -0.7, 1], [0.6, 0.6, 1], [-0.5, 0.4, 1]])[:, :, None]
+        corner = corner + 0.1 * np.asarray(self.normal(4, 3, vertices))
+        return self.array(corner / np.linalg.norm(corner, axis=1, keepdims=True))
 
     def mixture(self, lobes=2):
         """Wide lobes on the sphere."""
@@ -623,6 +630,15 @@ EXAMPLES = {
     "sphere.cubemap.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
     "systems.lamps.relight.ray_share": example(
         lambda draw: call(draw.uniform(5, low=2, high=90), draw.uniform(5, low=0.05, high=0.5))
+    ),
+    "systems.lamps.outline.solid_angle": example(lambda draw: call(draw.polygon())),
+    "systems.lamps.outline.vector_area": example(lambda draw: call(draw.polygon())),
+    "systems.lamps.outline.lobe_integral": example(
+        lambda draw: call(
+            draw.array(np.moveaxis(np.asarray(draw.upper(2, 4)), -1, 0)),
+            draw.uniform(2, 4, low=2, high=90),
+            draw.polygon(),
+        )
     ),
     "systems.lamps.relight.mean_density": example(
         lambda draw: call(

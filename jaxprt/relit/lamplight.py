@@ -6,6 +6,7 @@ depend on the colors of lamps. Rays are cast on the host. They are constants of 
 
 import dataclasses
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Int
@@ -19,7 +20,7 @@ from jaxprt.scene import Mesh, PointLight
 from jaxprt.scene.mesh import split
 from jaxprt.scene.points import Points, placed
 from jaxprt.systems.lamps import LampTransport
-from jaxprt.systems.lamps.places import at_points, places
+from jaxprt.systems.lamps.places import at_points, outlines, places
 from jaxprt.visibility import picture_rays
 from jaxprt.visibility.picture_rays import LampPlaces
 
@@ -55,12 +56,12 @@ class LampLight:
         return [*(meshes[part] for part in emitting), *self.stage.point_lights]
 
     @cached_property
-    def _places(self) -> dict[int, LampPlaces]:
-        """Places on the lamps, by the number of pieces of each surface, as far as they were needed."""
+    def _places(self) -> dict[int, tuple[LampPlaces, Any]]:
+        """Places on the lamps and outlines, by the number of pieces of each surface, as far as they were needed."""
         return {}
 
-    def _places_for(self, group: int) -> LampPlaces:
-        """Places on the lamps for the points of a group."""
+    def _places_for(self, group: int) -> tuple[LampPlaces, Any]:
+        """Places on the lamps for the points of a group, and outlines."""
         curvature, parts = self.stage.curvature, list(self.stage.layout.parts[group])
         # Roughness that JAX traces may become small.
         smooth = not known(curvature) or np.asarray(curvature)[parts].max() > _SMOOTH
@@ -68,7 +69,8 @@ class LampLight:
         pieces = _FINE if smooth and few else _COARSE
         if pieces not in self._places:
             with compile_time(self.stage.whole):  # Derivatives trace the shading of a row.
-                self._places[pieces] = places(self._sources, np.asarray(self.stage.power), pieces=pieces)
+                on_lamps = places(self._sources, np.asarray(self.stage.power), pieces=pieces)
+                self._places[pieces] = on_lamps, outlines(self._sources, on_lamps)
         return self._places[pieces]
 
     def row(self, group: int, index: Int[Array | np.ndarray, " p"], on_group: Points) -> LampTransport:
@@ -84,9 +86,9 @@ class LampLight:
             position, frame = placed(surface.position, surface.frame, on_group)
         points = canvas.traced(self.pixels, self.width, np.asarray(index))
         fields = np.asarray(position), np.asarray(frame)[:, 2]
-        lamp_places = self._places_for(group)
-        moment = picture_rays.moments(self._caster.triangles, self._caster.occluder, points, *fields, lamp_places)
-        return at_points(moment, position, frame, self._sources, lamp_places.pieces)
+        on_lamps, flat = self._places_for(group)
+        moment = picture_rays.moments(self._caster.triangles, self._caster.occluder, points, *fields, on_lamps)
+        return at_points(moment, position, frame, self._sources, on_lamps.pieces, flat)
 
 
 def of(stage: Stage, pixels: Pixels, width: int) -> LampLight | None:

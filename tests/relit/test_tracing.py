@@ -108,10 +108,12 @@ def test_a_mirror_shows_a_wall_that_glows_where_the_closed_form_has_it():
     assert bare.sum() > 8
     np.testing.assert_allclose(color[shown], np.broadcast_to(ALBEDO * GLOW, (shown.sum(), 3)), rtol=COARSE)
     np.testing.assert_allclose(color[bare], 0, atol=FAINT)
-    # Without rays the wall is four disks, which are bright in their middles and leave gaps.
-    disks = np.asarray(ready.with_rays(0).radiance(DARK, eye=EYE))[:49]
-    assert np.abs(disks - color)[shown].max() > 0.1
-    assert abs(disks[shown].mean() / color[shown].mean() - 1) < 0.5
+    # Without rays the wall is a polygon, which lobes blur.
+    polygon = np.asarray(ready.with_rays(0).radiance(DARK, eye=EYE))[:49]
+    np.testing.assert_allclose(
+        polygon[inside > 0.2], np.broadcast_to(ALBEDO * GLOW, (np.sum(inside > 0.2), 3)), rtol=0.05
+    )
+    np.testing.assert_allclose(polygon[bare], 0, atol=FAINT)
 
 
 def test_points_batches_and_programs_agree_with_the_vertices(close):

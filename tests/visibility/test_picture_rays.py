@@ -246,7 +246,9 @@ def test_point_lights_and_spots_have_one_place():
     way = np.asarray(bulb.position) - position
     square = np.sum(way**2, 1)
     frame = np.tile(np.array([[1.0, 0, 0], [0, 0, 1], [0, 1, 0]], np.float32), (len(way), 1, 1))
-    transport = at_points(moment, *jax.device_put((np.float32(position), frame)), [bulb, spot], np.array([1, 1]))
+    transport = at_points(
+        moment, *jax.device_put((np.float32(position), frame)), [bulb, spot], np.array([1, 1]), (None, ())
+    )
     np.testing.assert_allclose(transport.solid_angle[0], 1 / square, rtol=1e-4)
     np.testing.assert_allclose(transport.cosine[0], way[:, 1] / square**1.5, rtol=1e-4)
     axes = (jax.numpy.tile(np.float32(each), (len(way), 1)) for each in ([0.6, 0.8, 0.0], [0.0, 0.0, 1.0]))

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, Float32, Int
 
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.scene import PointLight
+from jaxprt.systems.lamps import outline
 from jaxprt.systems.lamps.transport import LampTransport, sample_surface
 from jaxprt.visibility.picture_rays import LampPlaces
 
@@ -45,6 +46,20 @@ def places(lamps: Sequence[Mesh | PointLight], power: Float[np.ndarray, " n"], *
     rays = 2 ** np.round(np.log2(np.maximum(_RAYS * share, 1)))
     strata = sides * np.clip(rays, _FEWEST, [_MOST if isinstance(lamp, Mesh) else _FEWEST for lamp in lamps])
     return LampPlaces(place, area, *(np.asarray(column, np.int64) for column in (first, count, cut, strata)))
+
+
+def outlines(
+    lamps: Sequence[Mesh | PointLight], on_lamps: LampPlaces
+) -> tuple[Float[Array, "f q k 3"] | None, tuple[int, ...]]:
+    """Outlines of flat lamps and of their pieces, and which lamps these are.
+
+    Args:
+        lamps: The lamps.
+        on_lamps: Places on them, from `places`.
+    """
+    first, count = on_lamps.first[:, -1], on_lamps.per_piece[:, -1] * on_lamps.pieces
+    finest = [on_lamps.place[start : start + size] for start, size in zip(first, count, strict=True)]
+    return outline.of_lamps(lamps, finest, on_lamps.pieces.tolist())
 
 
 def _levels(lamp: Mesh | PointLight) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -88,6 +103,7 @@ def at_points(
     frame: Float[Array, "p 3 3"],
     lamps: Sequence[Mesh | PointLight],
     pieces: Int[np.ndarray, " n"],
+    outlines: tuple[Float[Array, "f q k 3"] | None, tuple[int, ...]],
 ) -> LampTransport:
     """The transport of lamps to the points of a picture.
 
@@ -97,6 +113,7 @@ def at_points(
         frame: Their shading frames; rows are tangent, bitangent, normal.
         lamps: The lamps.
         pieces: Number of pieces of each.
+        outlines: The result of `outlines`.
     """
     where = np.asarray(position)
     for row, lamp in zip(np.cumsum(pieces) - pieces, lamps, strict=True):
@@ -108,4 +125,4 @@ def at_points(
                 integral[row] *= share
     number = tuple(np.repeat(np.arange(len(lamps)), pieces).tolist())
     solid, cosine, direction = (jax.device_put(row.astype(where.dtype, copy=False)) for row in moment)
-    return LampTransport(solid, cosine, direction, position, frame, number)
+    return LampTransport(solid, cosine, direction, position, frame, number, *outlines)

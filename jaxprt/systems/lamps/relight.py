@@ -12,6 +12,9 @@ where Omega is the visible solid angle and X is noncentral chi-squared with two 
 For disks larger than the lobe, P is computed by Sankaran's approximation. For smaller disks, the disk is treated as a
 lobe too, and the variances r^2 / 4 and 1 / k add.
 
+Flat and convex lamps are polygons, over which integrals of lobes are exact (`jaxprt.systems.lamps.outline`). What hides
+of them is the mean over their pieces, as far as each lobe sees these as other lobes.
+
 Where narrow lobes are traced by rays, for reflections of other surfaces, the rays also hit the lamps and show their
 true shapes. The share of a lobe that is narrow relative to the lamp is then left to the rays, and the rest is computed
 here.
@@ -29,9 +32,10 @@ from jaxtyping import Array, Float
 
 from jaxprt import require
 from jaxprt.brdf.models import color
-from jaxprt.compile import jit
+from jaxprt.compile import jit, total
 from jaxprt.scene.points import VERTICES, Points, placed
 from jaxprt.sphere import directions
+from jaxprt.systems.lamps.outline import lobe_integral, solid_angle, vector_area
 from jaxprt.systems.lamps.transport import LampTransport
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.lobe.table import LobeMixture, traced_share
@@ -40,6 +44,9 @@ from jaxprt.systems.protocol import Blend, check_blend
 _SMALL, _LARGE = 0.5, 2.0  # squared chords, in variances of the lobe, between which the two approximations blend
 _RATHER = np.log(9.0)  # the share of rays rises while the lamp's radius goes from 1 to 3 standard deviations
 _TINY = 1e-30
+_LEAST = 1e-9  # solid angle of pieces
+_FAR = 1e-12  # density of lobes far from a lamp
+_ALIKE = 0.02  # shares of pieces that differ less are one
 
 
 class LitByLamps(eqx.Module):
@@ -132,17 +139,23 @@ def _view(
 ) -> Float[Array, "n v c"]:
     transport = lit.transport
     solid, cosine, way = _integrals(transport, points)
-    matte = cosine / np.pi
+    matte, numbers = cosine / np.pi, np.asarray(transport.lamp)
     if lit.brdf is None:
-        piece = matte[:, None] * (lit.albedo[:, None] if blend is None else 1)
+        rows = matte[:, None] * (lit.albedo[:, None] if blend is None else 1)
     else:
         position, frame = placed(transport.position, transport.frame, points)
         parameter = () if blend is None else blend.parameter
         lobe = lit.brdf.lookup(directions.view(frame, position, eye), *parameter)
-        whole = _chord(transport, points)[np.asarray(transport.lamp)]
-        piece = jax.lax.map(partial(_reflect, lobe, frame, traced), (solid, way, matte, whole))
-    numbers = np.asarray(transport.lamp)
-    value = jax.ops.segment_sum(piece, numbers, transport.lamps, indices_are_sorted=True)  # [n, k, v]
+        whole, flat = _chord(transport, points), list(transport.flat)
+        round_ = np.flatnonzero(~np.isin(numbers, flat))
+        reflect = partial(_reflect, lobe, frame, traced)
+        rows = jax.lax.map(reflect, (solid[round_], way[round_], matte[round_], whole[numbers[round_]]))
+        if transport.outline is not None:
+            piece = np.stack([np.flatnonzero(numbers == number) for number in flat])
+            reflect = partial(_reflect_flat, lobe, position, frame, traced)
+            more = jax.lax.map(reflect, (transport.outline, solid[piece], matte[piece], whole[np.asarray(flat)]))
+            rows, numbers = jnp.concatenate([rows, more]), np.concatenate([numbers[round_], flat])
+    value = jnp.zeros((transport.lamps, *rows.shape[1:]), rows.dtype).at[numbers].add(rows)  # [n, k, v]
     if blend is None:
         return jnp.moveaxis(value, 1, 2)
     return jnp.einsum("nkv,vkc->nvc", value, blend.weight, precision="highest")
@@ -185,13 +198,48 @@ def ray_share(concentration: Float[Array, "*b"], chord: Float[Array, "*c"]) -> F
 def _reflect(lobe: LobeMixture, frame: Array, traced: Array | None, piece: tuple[Array, ...]) -> Float[Array, "k v"]:
     """Radiance reflected by each channel of the BRDF, from one piece of a lamp of radiance 1."""
     solid, way, matte, whole = piece
-    length = jnp.sqrt(jnp.maximum(jnp.sum(way**2, 0), _TINY))
-    toward = [sum(way[j] * frame[:, i, j] for j in range(3)) / length for i in range(3)]
-    chord = 4 * jnp.clip(1 - length / jnp.maximum(solid, _TINY), 0, 1)
-    density = mean_density(lobe.mean, lobe.concentration, toward, chord)
+    local = jnp.stack([sum(way[j] * frame[:, i, j] for j in range(3)) for i in range(3)])
+    return _sent(lobe, traced, whole, mean_density(lobe.mean, lobe.concentration, *_disk(solid, local)) * solid, matte)
+
+
+def _sent(lobe: LobeMixture, traced: Array | None, whole: Array, share: Array, matte: Array) -> Float[Array, "k v"]:
+    """Radiance reflected by each channel, from the share of each lobe that a lamp fills, without what rays trace."""
     if traced is not None:
-        density = density * (1 - traced * traced_share(lobe.concentration) * ray_share(lobe.concentration, whole))
-    return jnp.sum(lobe.weight * density, 1) * solid + lobe.diffuse * matte
+        share = share * (1 - traced * traced_share(lobe.concentration) * ray_share(lobe.concentration, whole))
+    return jnp.sum(lobe.weight * share, 1) + lobe.diffuse * matte
+
+
+def _disk(solid: Array, way: Array) -> tuple[list[Array], Array]:
+    """Center and squared chord of the disk with the same integrals of 1 and of the direction."""
+    length = jnp.sqrt(jnp.maximum(jnp.sum(way**2, 0), _TINY))
+    return [axis / length for axis in way], 4 * jnp.clip(1 - length / jnp.maximum(solid, _TINY), 0, 1)
+
+
+def _reflect_flat(
+    lobe: LobeMixture, position: Array, frame: Array, traced: Array | None, lamp: tuple[Array, ...]
+) -> Float[Array, "k v"]:
+    """Radiance reflected by each channel of the BRDF, from a flat lamp of radiance 1."""
+    outline, solid, matte, whole = lamp
+    way = outline[..., None] - position.T
+    local = jnp.stack([sum(way[:, :, j] * frame[:, i, j] for j in range(3)) for i in range(3)], 2)  # [q k 3 v]
+    local = local / jnp.sqrt(jnp.maximum(jnp.sum(local**2, 2, keepdims=True), _TINY))
+    full = jnp.maximum(jax.vmap(solid_angle)(local[1:]), _LEAST)
+    visible, share = jnp.sum(solid, 0) / jnp.sum(full, 0), solid / full
+
+    def seen(row: tuple[Array, ...]) -> Array:
+        corner, full, share = row
+        toward, chord = _disk(full, vector_area(corner))
+        part = (_as_lobes(lobe.mean, lobe.concentration, toward, chord)[0] + _FAR) * full
+        return jnp.stack([part, part * share])
+
+    def partly() -> Array:
+        part, lit = total(seen, (local[1:], full, share))
+        return lit / part
+
+    alike = jnp.all(jnp.abs(share - visible) < _ALIKE)
+    shown = jax.lax.cond(alike, lambda: jnp.broadcast_to(visible, lobe.concentration.shape), partly)
+    filled = lobe_integral(lobe.mean, lobe.concentration, local[0]) * shown
+    return _sent(lobe, traced, whole, filled, jnp.sum(matte, 0))
 
 
 def mean_density(mean: Array, concentration: Array, toward: Sequence[Array], chord: Array) -> Float[Array, "l v"]:
@@ -206,9 +254,7 @@ def mean_density(mean: Array, concentration: Array, toward: Sequence[Array], cho
     Returns:
         Mean densities. Times pi times the squared chord, they are the integrals of the lobes over the disks.
     """
-    apart = sum((mean[i] - toward[i]) ** 2 for i in range(3))
-    variance = 1 / concentration + chord / 4
-    small = jnp.exp(-apart / (2 * variance)) / (2 * np.pi * variance)
+    small, apart = _as_lobes(mean, concentration, toward, chord)
     size = concentration * chord
     share = jnp.clip((size - _SMALL) / (_LARGE - _SMALL), 0, 1)
     share = share**2 * (3 - 2 * share)
@@ -216,6 +262,13 @@ def mean_density(mean: Array, concentration: Array, toward: Sequence[Array], cho
     large = inside / (np.pi * jnp.maximum(chord, _SMALL / concentration))
     # Normalizes the normal distribution, which is cut off at a chord of 2.
     return (small + share * (large - small)) / -jnp.expm1(-2 * concentration)
+
+
+def _as_lobes(mean: Array, concentration: Array, toward: Sequence[Array], chord: Array) -> tuple[Array, Array]:
+    """Mean density of lobes over disks that are treated as lobes too, and squared distances from their centers."""
+    apart = sum((mean[i] - toward[i]) ** 2 for i in range(3))
+    variance = 1 / concentration + chord / 4
+    return jnp.exp(-apart / (2 * variance)) / (2 * np.pi * variance), apart
 
 
 def _inside(size: Array, offset: Array) -> Array:

@@ -26,6 +26,7 @@ from jaxprt.files.arrays import Header, Layout, sketch
 from jaxprt.scene import origin as origins
 from jaxprt.scene.mesh import Mesh, relative
 from jaxprt.scene.scene import PointLight
+from jaxprt.systems.lamps import outline
 from jaxprt.visibility.blocks import Run
 from jaxprt.visibility.occluder import offsets
 from jaxprt.visibility.rays import PRECOMPUTE
@@ -50,6 +51,8 @@ class LampTransport(eqx.Module):
         position: Vertex positions in world units.
         frame: Shading frame of each vertex; rows are tangent, bitangent, normal.
         lamp: Index of the lamp that each piece belongs to.
+        outline: Corners of flat and convex lamps f, and then of the pieces of each, in world units; None without.
+        flat: Indices of these lamps.
     """
 
     solid_angle: Float[Array, "m v"]
@@ -58,6 +61,8 @@ class LampTransport(eqx.Module):
     position: Float[Array, "v 3"]
     frame: Float[Array, "v 3 3"]
     lamp: tuple[int, ...] = eqx.field(static=True)
+    outline: Float[Array | np.ndarray, "f q k 3"] | None = None
+    flat: tuple[int, ...] = eqx.field(static=True, default=())
 
     @property
     def lamps(self) -> int:
@@ -130,7 +135,9 @@ def precompute(
     moment = visibility.blocks.compute(job, run, label="lamps")["moment"]
     solid, cosine, *direction = (jax.device_put(np.ascontiguousarray(row.T)) for row in np.moveaxis(moment, 2, 0))
     position, frame = visibility.rays.place(mesh, vertex), jax.device_put(job.frame)
-    return LampTransport(solid, cosine, jnp.stack(direction, 1), position, frame, tuple(owner.tolist()))
+    places = np.split(coarse.place, np.cumsum(np.bincount(owner, coarse.piece).astype(int))[:-1])
+    flat = outline.of_lamps(lamps, places, [pieces] * len(lamps))
+    return LampTransport(solid, cosine, jnp.stack(direction, 1), position, frame, tuple(owner.tolist()), *flat)
 
 
 def _relative(lamp: Mesh | PointLight, origin: origins.Origin) -> Mesh | PointLight:

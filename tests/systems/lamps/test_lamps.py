@@ -8,15 +8,17 @@ import scipy.stats
 
 from jaxprt import lamps, lobe
 from jaxprt.brdf import GGX
-from jaxprt.scene import Mesh, PointLight
+from jaxprt.scene import Mesh, PointLight, builtin
 from jaxprt.scene.mesh import join, make_mesh
 from jaxprt.scene.points import on_triangles
 from jaxprt.sphere import directions
+from jaxprt.systems.lamps.outline import lobe_integral
 from jaxprt.systems.protocol import Blend
+from jaxprt.visibility.blocks import Run
 
 HEIGHT, SIDE = 0.8, 0.3
 SAMPLED = 0.01  # what 256 points on a lamp leave of its irradiance, relative to the norm
-LAMP_SHAPED = 0.03  # what disks in the place of a sixteenth of a square leave of a highlight, relative to the norm
+FLAT_SHAPED = 0.015  # of a highlight of a flat lamp, relative to the norm: it has the solid angle that samples see
 
 
 def square(center, half: float, *, down: bool) -> Mesh:
@@ -37,6 +39,7 @@ def floor(cells: int) -> Mesh:
 
 GROUND, LAMP = floor(7), square([0, HEIGHT, 0], SIDE, down=True)
 COUNT = len(GROUND.position)
+QUIET = Run(progress=False)
 BULB = PointLight("bulb", [0.2, 0.5, -0.3], 2.0)
 
 
@@ -157,6 +160,74 @@ def test_lobes_over_disks_are_normal_distributions_over_disks(chord):
         assert np.abs(got - expected).max() <= 0.03 * expected.max()
 
 
+@pytest.mark.parametrize("concentration", [3.0, 30.0, 1000.0])
+def test_lobes_over_polygons_are_sums_over_the_sphere(concentration):
+    """For 24 lobes around a square of .3 to 1.5 radians, a long panel, and a triangle beside which lobes are pads."""
+    random = np.random.default_rng(0)
+    square_ = np.array([[-0.2, -0.2, 1], [0.2, -0.2, 1], [0.2, 0.2, 1], [-0.2, 0.2, 1]])
+    for corner in (square_, square_ * [4, 4, 1], square_ * [5, 0.3, 1] + [0.3, 0, 0], square_[[0, 1, 2, 2]]):
+        unit = corner / np.linalg.norm(corner, axis=1, keepdims=True)
+        # Each triangle of a fan by the middles of 300 x 300 cells of a square, of which one side is its first corner.
+        u, v = np.meshgrid(*[(np.arange(300) + 0.5) / 300] * 2)
+        first, second, third = corner[0], corner[1:-1, None, None], corner[2:, None, None]
+        place = first + u[..., None] * (second - first + v[..., None] * (third - second))
+        length = np.linalg.norm(place, axis=-1)
+        area = u / 300**2 * np.linalg.norm(np.cross(second - first, third - first), axis=-1) / length**3
+        mean = random.dirichlet(np.ones(4), 24) @ corner + random.normal(size=(24, 3)) * [0.1, 0.1, 0]
+        mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+        peak = concentration / (-2 * np.pi * np.expm1(-2 * concentration))
+        way = place / length[..., None]
+        expected = [np.sum(peak * np.exp(concentration * (way @ m - 1)) * area) for m in mean]
+        sharp = jnp.full((24, 1), concentration, jnp.float32)
+        got = np.asarray(
+            lobe_integral(jnp.asarray(mean.T[..., None], jnp.float32), sharp, jnp.asarray(unit[..., None], jnp.float32))
+        )
+        np.testing.assert_allclose(got[:, 0], expected, atol=2e-3)
+        assert np.ptp(expected) > 0.1 * np.max(expected)
+
+
+def test_integrals_over_polygons_and_their_slopes_are_finite_where_means_are_corners_poles_and_on_edges():
+    corner = np.array([[-0.6, 0, 0.8], [0.6, 0, 0.8], [0.6, 0.8, 0], [0, 0.8, 0.6], [-0.3, 0.4, 0.7]])
+    corner[-1] /= np.linalg.norm(corner[-1])
+    mean = np.concatenate([corner, [[0, 0, 1], [0, 1, 0], [0, -1, 0], [1, 0, 0]], np.cross(corner[0], corner[1:2])])
+    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+    arguments = [np.float32(each) for each in (mean.T[..., None], np.full((len(mean), 1), 50), corner[..., None])]
+    value = lobe_integral(*arguments)
+    assert np.all((np.asarray(value) >= 0) & (np.asarray(value) <= 1))
+    for slope in jax.jit(jax.grad(lambda *x: jnp.sum(lobe_integral(*x) ** 2), argnums=(0, 1, 2)))(*arguments):
+        assert np.isfinite(slope).all()
+
+
+def flat_lamps(mesh: Mesh) -> tuple[int, ...]:
+    return lamps.precompute(GROUND, [mesh], samples=16, run=QUIET).flat
+
+
+def test_flat_convex_lamps_are_polygons_and_others_are_disks():
+    grid = floor(9)
+    turn = np.array([[0.6, 0, 0.8], [0, 1, 0], [-0.8, 0, 0.6]])
+    for mesh in (LAMP, grid, make_mesh(np.asarray(grid.position) @ turn, grid.face)):
+        assert flat_lamps(mesh) == (0,)
+    eight, nine = (disk(corners) for corners in (8, 9))
+    assert flat_lamps(eight) == (0,)
+    assert flat_lamps(make_mesh(LAMP.position, np.asarray(LAMP.face)[:1])) == (0,)
+    position, face = np.asarray(grid.position), np.asarray(grid.face)
+    corner = face[np.any(position[face].min(1)[:, [0, 2]] < -0.5, 1)]
+    sheet = join([LAMP, square([0, HEIGHT, 0], SIDE, down=False)])
+    bent = make_mesh(position + [0, 0.1, 0] * position[:, :1] ** 2, face)
+    for mesh in (nine, make_mesh(position, corner), sheet, bent, builtin.sphere(rings=8, sectors=16)):
+        assert flat_lamps(mesh) == ()
+    both = lamps.precompute(GROUND, [BULB, sheet, LAMP], samples=16, run=QUIET)
+    assert both.flat == (2,)
+    np.testing.assert_allclose(both.outline[0, 1:].sum(0).mean(0), 4 * np.array([0, HEIGHT, 0]), atol=1e-6)
+
+
+def disk(corners: int) -> Mesh:
+    angle = 2 * np.pi * np.arange(corners) / corners
+    position = np.stack([np.cos(angle), 1 + 0 * angle, np.sin(angle)], -1)
+    rest = np.arange(1, corners - 1)
+    return make_mesh(position, np.stack([0 * rest, rest, rest + 1], 1), normal=np.tile([0.0, -1.0, 0.0], (corners, 1)))
+
+
 reflected = jax.jit(lambda table, wi, wo: table(wi, wo))
 
 
@@ -184,7 +255,7 @@ def test_highlights_of_lamps_are_integrals_over_the_lamp(close):
         assert np.all(left >= 0)
         expected = lamp_integral(value)
         got = np.asarray(lit.combine(jnp.array([[1.0], [0.0]]), sent))[:, 0]
-        assert np.linalg.norm(got - expected) <= LAMP_SHAPED * np.linalg.norm(expected)
+        assert np.linalg.norm(got - expected) <= FLAT_SHAPED * np.linalg.norm(expected)
         way = np.asarray(BULB.position) - np.asarray(GROUND.position)
         unit = way / np.linalg.norm(way, axis=1, keepdims=True)
         wi = jnp.asarray(np.einsum("vij,vj->vi", frame, unit), jnp.float32)

@@ -1,0 +1,249 @@
+"""Flat lamps as polygons: outlines of meshes, and integrals of lobes over polygons on the sphere.
+
+A von Mises-Fisher lobe of mean m and concentration k has 1 - exp(-k (1 - cos t)) of what it has in all within an angle
+t of its mean. Its integral over a polygon is therefore a sum of integrals along edges, over the azimuth about m:
+
+    ∫ p(wi; m, k) dwi = 1 / (2 pi (1 - exp(-2 k))) sum_edges ∫ 1 - exp(-k (1 - cos t)) dψ
+
+As a function of the length along the edge's great circle the integrand has no peaks narrower than the lobe. Far from
+the lobe's mean it is 1, and the integral is an angle.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import reduce
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.spatial
+from jaxtyping import Array, Float
+
+from jaxprt.compile import jit, put, total
+from jaxprt.scene.mesh import Mesh
+from jaxprt.scene.scene import PointLight
+
+_CORNERS = 8  # most corners of an outline
+_FLAT = 1e-3  # largest distance of corners from their plane, and area outside of triangles, relative to the extent
+_STRAIGHT = 1e-6  # area that a corner adds, relative to that of the polygon, below which it is none
+_REACH = 3.5  # distance along an edge from which on all of a lobe is nearer, in standard deviations
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
+_HALVINGS = 40  # of the range in which an outline is cut
+_SMALL = 0.02
+_TINY = 1e-12
+
+
+def of_lamps(
+    lamps: Sequence[Mesh | PointLight], places: Sequence[np.ndarray], pieces: Sequence[int]
+) -> tuple[Float[Array, "f q k 3"] | None, tuple[int, ...]]:
+    """Outlines of the flat and convex lamps and of their pieces, for a `LampTransport`, and the indices of these lamps.
+
+    Args:
+        lamps: The lamps.
+        places: Places [s 3] on each, in the order of its pieces.
+        pieces: Number of pieces of each surface, a power of two.
+    """
+    polygons = {
+        number: [whole, *_cut(whole, np.asarray(place, np.float64), count)]
+        for number, (lamp, place, count) in enumerate(zip(lamps, places, pieces, strict=True))
+        if isinstance(lamp, Mesh) and (whole := _of(lamp)) is not None
+    }
+    if not polygons:
+        return None, ()
+    corners = max(len(polygon) for row in polygons.values() for polygon in row)
+    return put(np.stack([_stacked(row, corners) for row in polygons.values()]).astype(jnp.result_type(float))), tuple(
+        polygons
+    )
+
+
+def _of(lamp: Mesh) -> Float[np.ndarray, "k 3"] | None:
+    """Outline of a flat and convex lamp, counterclockwise for those on whom it shines; None for other lamps."""
+    corner, normal = (np.asarray(row, np.float64)[np.asarray(lamp.face)] for row in (lamp.position, lamp.normal))
+    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
+    across *= np.where(np.sum(across * normal.sum(1), 1) < 0, -1, 1)[:, None]
+    area, whole = np.linalg.norm(across, axis=1), np.linalg.norm(across.sum(0))
+    if not whole >= (1 - _FLAT) * area.sum() > 0:
+        return None
+    place = corner[area > 0].reshape(-1, 3)
+    place = place - place.mean(0)
+    # What is lit sees the plane from its front, where directions to corners turn the other way round.
+    up = -across.sum(0) / whole
+    side = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    side /= np.linalg.norm(side)
+    plane = np.stack([place @ side, place @ np.cross(up, side)], 1)
+    if np.ptp(place @ up) > _FLAT * np.sqrt(whole):
+        return None
+    try:
+        hull = scipy.spatial.ConvexHull(plane)
+    except scipy.spatial.QhullError:  # the lamp is as narrow as rounding
+        return None
+    number = list(hull.vertices)
+    while len(number) > 3:  # Qhull keeps corners on straight edges.
+        before, here, after = (plane[np.roll(number, shift)] for shift in (1, 0, -1))
+        (ax, ay), (bx, by) = (here - before).T, (after - here).T
+        adds = np.abs(ax * by - ay * bx) / 2
+        if adds.min() > _STRAIGHT * whole:
+            break
+        number.pop(int(np.argmin(adds)))
+    if len(number) > _CORNERS or hull.volume > (1 + _FLAT) * whole:
+        return None
+    return corner[area > 0].reshape(-1, 3)[number]
+
+
+def _cut(
+    outline: Float[np.ndarray, "k 3"], place: Float[np.ndarray, "s 3"], count: int
+) -> list[Float[np.ndarray, "_ 3"]]:
+    """Pieces of equal area of an outline, cut about as places on it are: by halving across the longest extent."""
+    if count == 1:
+        return [outline]
+    axis, half = int(np.argmax(np.ptp(place, axis=0))), len(place) // 2
+    along = outline[:, axis]
+    low, high = along.min(), along.max()
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        if _area(_below(outline, along - middle)) > _area(outline) / 2:
+            high = middle
+        else:
+            low = middle
+    return [
+        part
+        for sign, rows in ((1, place[:half]), (-1, place[half:]))
+        for part in _cut(_below(outline, sign * (along - middle)), rows, count // 2)
+    ]
+
+
+def _area(outline: Float[np.ndarray, "k 3"]) -> float:
+    return float(np.linalg.norm(np.cross(outline, np.roll(outline, -1, 0)).sum(0)) / 2)
+
+
+def _below(outline: Float[np.ndarray, "k 3"], height: Float[np.ndarray, " k"]) -> Float[np.ndarray, "_ 3"]:
+    """The part of a convex polygon whose heights are not above 0."""
+    result = []
+    for start, end, low, high in zip(outline, np.roll(outline, -1, 0), height, np.roll(height, -1), strict=True):
+        if low <= 0:
+            result.append(start)
+        if low * high < 0:
+            result.append(start + low / (low - high) * (end - start))
+    return np.asarray(result)
+
+
+def _stacked(polygons: Sequence[Float[np.ndarray, "_ 3"]], corners: int) -> Float[np.ndarray, "n k 3"]:
+    """Polygons with equally many corners: those with fewer get more of them on their longest edges."""
+    rows = []
+    for polygon in polygons:
+        while len(polygon) < corners:
+            step = np.roll(polygon, -1, 0) - polygon
+            longest = int(np.argmax(np.linalg.norm(step, axis=1)))
+            polygon = np.insert(polygon, longest + 1, polygon[longest] + step[longest] / 2, axis=0)
+        rows.append(polygon)
+    return np.stack(rows)
+
+
+@jit
+def solid_angle(corner: Float[Array, "k 3 v"]) -> Float[Array, " v"]:
+    """Solid angles of convex polygons on the sphere.
+
+    Args:
+        corner: Unit directions of the corners, counterclockwise.
+
+    Reference: Van Oosterom, Strackee, "The solid angle of a plane triangle", 1983.
+    """
+    start, second, third = corner[:1], corner[1:-1], corner[2:]
+    triple = jnp.sum(start * jnp.stack(_cross(*(jnp.moveaxis(at, 1, 0) for at in (second, third))), 1), 1)
+    beside = 1 + sum(jnp.sum(a * b, 1) for a, b in ((start, second), (second, third), (third, start)))
+    return jnp.sum(2 * jnp.arctan2(triple, beside), 0)
+
+
+@jit
+def vector_area(corner: Float[Array, "k 3 v"]) -> Float[Array, "3 v"]:
+    """Integrals of the unit direction over convex polygons on the sphere.
+
+    Args:
+        corner: Unit directions of the corners, counterclockwise.
+
+    Reference: Arvo, "Applications of irradiance tensors to the simulation of non-Lambertian phenomena", 1995.
+    """
+    normal, angle = _edges(corner, jnp.roll(corner, -1, 0))
+    return jnp.sum(normal * angle[:, None] / 2, 0)
+
+
+@jit
+def lobe_integral(
+    mean: Float[Array, "3 l v"], concentration: Float[Array, "l v"], corner: Float[Array, "k 3 v"]
+) -> Float[Array, "l v"]:
+    """Integrals of von Mises-Fisher lobes over convex polygons on the sphere, to about 1e-3.
+
+    Args:
+        mean: Unit directions of the lobes.
+        concentration: Concentrations of the lobes.
+        corner: Unit directions of the corners, counterclockwise; less than a half of the sphere lies within.
+    """
+    reach = jnp.minimum(_REACH / jnp.sqrt(concentration), np.pi)
+    sine_of_reach, cosine_of_reach = jnp.sin(reach), jnp.cos(reach)
+
+    def edge(row: tuple[Array, ...]) -> Array:
+        start, end, normal, angle = row
+        # Lengths along the great circle of the edge begin where it is closest to the mean.
+        sine = _dot(mean, normal)
+        cosine = jnp.sqrt(jnp.maximum(1 - sine**2, _TINY))
+        ends = [_place(_dot(mean, jnp.stack(_cross(at, normal))), _dot(mean, at), cosine) for at in (start, end)]
+        first = jnp.arctan2(*ends[0])
+        first = jnp.where(first + angle / 2 > np.pi, first - 2 * np.pi, first)
+        length = first, first + angle
+        low, high = (jnp.clip(at, -reach, reach) for at in length)
+        half, middle, near = (high - low) / 2, (high + low) / 2, jnp.zeros_like(sine)
+        for node, weight in zip(_NODES, _WEIGHTS, strict=True):
+            away = sine**2 / (1 + cosine) + cosine * _versed((middle + half * node) ** 2)
+            near += weight * concentration * _share(concentration * away) / jnp.maximum(2 - away, 1e-6)
+        # Less what all of the lobe within reach would be, the difference of two azimuths about the mean.
+        low_sine, low_cosine, high_sine, high_cosine = (
+            jnp.where(at == cut, here, there)
+            for (across, along), at, cut in zip(ends, length, (low, high), strict=True)
+            for here, there in ((across, jnp.where(at > 0, sine_of_reach, -sine_of_reach)), (along, cosine_of_reach))
+        )
+        flat = jnp.maximum(jnp.abs(sine), _TINY)
+        whole = jnp.arctan2(
+            flat * (high_sine * low_cosine - high_cosine * low_sine),
+            flat**2 * high_cosine * low_cosine + high_sine * low_sine,
+        )
+        return sine * half * near - jnp.where(sine < 0, -whole, whole)
+
+    normal, angle = _edges(corner, jnp.roll(corner, -1, 0))
+    inside = reduce(jnp.logical_and, (_dot(mean, side) >= 0 for side in normal))
+    edges = corner, jnp.roll(corner, -1, 0), normal, angle
+    within = jnp.where(inside, 2 * np.pi, 0) + total(edge, edges)
+    return jnp.clip(within / (-2 * np.pi * jnp.expm1(-2 * concentration)), 0, 1)
+
+
+def _place(across: Array, along: Array, length: Array) -> tuple[Array, Array]:
+    """Sine and cosine of a length along a great circle; of 0 for poles of the circle and edges without length."""
+    none = across**2 + along**2 < length**2 / 2
+    return jnp.where(none, 0, across / length), jnp.where(none, 1, along / length)
+
+
+def _versed(square: Array) -> Array:
+    """1 - cos x from the square of x, to 1e-4 at pi and to rounding at 0."""
+    terms = [(-1) ** (n + 1) / math.factorial(2 * n) for n in range(7, 0, -1)]
+    return square * reduce(lambda value, term: value * square + term, terms[1:], jnp.full_like(square, terms[0]))
+
+
+def _share(x: Array) -> Array:
+    """(1 - exp(-x)) / x."""
+    small = x < _SMALL
+    return jnp.where(small, 1 - x / 2 + x**2 / 6, (1 - jnp.exp(-x)) / jnp.where(small, 1, x))
+
+
+def _edges(start: Float[Array, "k 3 v"], end: Float[Array, "k 3 v"]) -> tuple[Array, Array]:
+    """Unit normals of the planes of edges, which point inside, and lengths of the edges."""
+    across, along = jnp.stack(_cross(jnp.moveaxis(start, 1, 0), jnp.moveaxis(end, 1, 0)), 1), jnp.sum(start * end, 1)
+    length = jnp.sqrt(jnp.maximum(jnp.sum(across**2, 1), _TINY**2))
+    return across / length[:, None], jnp.arctan2(length, along)
+
+
+def _cross(first: Array, second: Array) -> tuple[Array, Array, Array]:
+    """Components of cross products; components are the first axis."""
+    (ax, ay, az), (bx, by, bz) = first, second
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+def _dot(mean: Float[Array, "3 l v"], direction: Float[Array, "3 v"]) -> Float[Array, "l v"]:
+    return mean[0] * direction[0] + mean[1] * direction[1] + mean[2] * direction[2]
