@@ -203,10 +203,10 @@ def reflected(scene: Scene, light: Environment, camera: Camera) -> tuple[np.ndar
 
 
 def lamp(sizes: Sizes) -> Pictures:
-    """A long panel over a polished floor: it counts as disks, which show."""
+    """A long panel over a polished floor, which shows its shape."""
     camera = Camera([0.0, 1.0, 2.2], [0.0, 0.0, -0.1], [0.0, 1.0, 0.0], 0.75, sizes.edge, sizes.edge)
     parts = [Part("floor", builtin.plane(cells=48), _polished(0.2)), Part("panel", _PANEL, _GLOWING)]
-    return lit_by_lamps(Scene(parts), camera, {"refine": False}, "disks")
+    return lit_by_lamps(Scene(parts), camera, {"refine": False}, "polygon")
 
 
 def bulb(sizes: Sizes) -> Pictures:

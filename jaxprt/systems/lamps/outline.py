@@ -15,6 +15,7 @@ from functools import reduce
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.optimize
 import scipy.spatial
 from jaxtyping import Array, Float
 
@@ -27,7 +28,6 @@ _FLAT = 1e-3  # largest distance of corners from their plane, and area outside o
 _STRAIGHT = 1e-6  # area that a corner adds, relative to that of the polygon, below which it is none
 _REACH = 3.5  # distance along an edge from which on all of a lobe is nearer, in standard deviations
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
-_HALVINGS = 40  # of the range in which an outline is cut
 _SMALL = 0.02
 _TINY = 1e-12
 
@@ -96,14 +96,10 @@ def _cut(
     if count == 1:
         return [outline]
     axis, half = int(np.argmax(np.ptp(place, axis=0))), len(place) // 2
-    along = outline[:, axis]
-    low, high = along.min(), along.max()
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        if _area(_below(outline, along - middle)) > _area(outline) / 2:
-            high = middle
-        else:
-            low = middle
+    along, area = outline[:, axis], _area(outline)
+    middle = scipy.optimize.brentq(
+        lambda height: _area(_below(outline, along - height)) - area / 2, along.min(), along.max()
+    )
     return [
         part
         for sign, rows in ((1, place[:half]), (-1, place[half:]))
@@ -112,7 +108,7 @@ def _cut(
 
 
 def _area(outline: Float[np.ndarray, "k 3"]) -> float:
-    return float(np.linalg.norm(np.cross(outline, np.roll(outline, -1, 0)).sum(0)) / 2)
+    return float(np.linalg.norm(np.cross(outline, np.roll(outline, -1, 0)).sum(0)) / 2) if len(outline) else 0.0
 
 
 def _below(outline: Float[np.ndarray, "k 3"], height: Float[np.ndarray, " k"]) -> Float[np.ndarray, "_ 3"]:

@@ -1,8 +1,11 @@
 """Reflected radiance of surfaces that are lit by lamps.
 
-The visible part of a lamp is approximated by a disk on the sphere with the same mean direction d and the same mean
-resultant length R; its squared chord from center to rim is r^2 = 4 (1 - R). In the chord, a von Mises-Fisher lobe with
-mean m and concentration k is a normal distribution of variance 1 / k. So
+Flat and convex lamps are polygons, over which integrals of lobes are exact (`jaxprt.systems.lamps.outline`). What hides
+of them is the mean over their pieces, as far as each lobe sees these as other lobes.
+
+The visible part of another lamp is approximated by a disk on the sphere with the same mean direction d and the same
+mean resultant length R; its squared chord from center to rim is r^2 = 4 (1 - R). In the chord, a von Mises-Fisher lobe
+with mean m and concentration k is a normal distribution of variance 1 / k. So
 
     ∫ p(wi; m, k) V dwi ~ Omega / (pi r^2) P(X <= k r^2)
 
@@ -11,9 +14,6 @@ where Omega is the visible solid angle and X is noncentral chi-squared with two 
 
 For disks larger than the lobe, P is computed by Sankaran's approximation. For smaller disks, the disk is treated as a
 lobe too, and the variances r^2 / 4 and 1 / k add.
-
-Flat and convex lamps are polygons, over which integrals of lobes are exact (`jaxprt.systems.lamps.outline`). What hides
-of them is the mean over their pieces, as far as each lobe sees these as other lobes.
 
 Where narrow lobes are traced by rays, for reflections of other surfaces, the rays also hit the lamps and show their
 true shapes. The share of a lobe that is narrow relative to the lamp is then left to the rays, and the rest is computed
@@ -147,14 +147,14 @@ def _view(
         parameter = () if blend is None else blend.parameter
         lobe = lit.brdf.lookup(directions.view(frame, position, eye), *parameter)
         whole, flat = _chord(transport, points), list(transport.flat)
-        round_ = np.flatnonzero(~np.isin(numbers, flat))
+        others = np.flatnonzero(~np.isin(numbers, flat))
         reflect = partial(_reflect, lobe, frame, traced)
-        rows = jax.lax.map(reflect, (solid[round_], way[round_], matte[round_], whole[numbers[round_]]))
+        rows = jax.lax.map(reflect, (solid[others], way[others], matte[others], whole[numbers[others]]))
         if transport.outline is not None:
             piece = np.stack([np.flatnonzero(numbers == number) for number in flat])
             reflect = partial(_reflect_flat, lobe, position, frame, traced)
             more = jax.lax.map(reflect, (transport.outline, solid[piece], matte[piece], whole[np.asarray(flat)]))
-            rows, numbers = jnp.concatenate([rows, more]), np.concatenate([numbers[round_], flat])
+            rows, numbers = jnp.concatenate([rows, more]), np.concatenate([numbers[others], flat])
     value = jnp.zeros((transport.lamps, *rows.shape[1:]), rows.dtype).at[numbers].add(rows)  # [n, k, v]
     if blend is None:
         return jnp.moveaxis(value, 1, 2)
@@ -266,7 +266,7 @@ def mean_density(mean: Array, concentration: Array, toward: Sequence[Array], cho
 
 def _as_lobes(mean: Array, concentration: Array, toward: Sequence[Array], chord: Array) -> tuple[Array, Array]:
     """Mean density of lobes over disks that are treated as lobes too, and squared distances from their centers."""
-    apart = sum((mean[i] - toward[i]) ** 2 for i in range(3))
+    apart = reduce(jnp.add, ((mean[i] - toward[i]) ** 2 for i in range(3)))
     variance = 1 / concentration + chord / 4
     return jnp.exp(-apart / (2 * variance)) / (2 * np.pi * variance), apart
 
