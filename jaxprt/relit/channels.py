@@ -96,8 +96,18 @@ class Shading(eqx.Module):
     @property
     def smoothest(self) -> Any:
         """Logarithm of the smallest roughness, as the standard table takes it: with that of a layer if any."""
-        least = tuple(float(np.min(np.asarray(row))) for row in self.weighted.parameter)
-        return least if self.layered else least[0]
+        return self._roughness(np.min)
+
+    @property
+    def roughest(self) -> Any:
+        """Logarithm of the largest roughness, as the standard table takes it: with that of the base for a layer."""
+        chosen = self._roughness(np.max)
+        return (chosen[0], chosen[0]) if self.layered else chosen
+
+    def _roughness(self, of_vertices: Callable) -> Any:
+        """One logarithm of the roughness of all vertices, as the standard table takes it."""
+        chosen = tuple(float(of_vertices(np.asarray(row))) for row in self.weighted.parameter)
+        return chosen if self.layered else chosen[0]
 
     @property
     def weighted(self) -> Blend:

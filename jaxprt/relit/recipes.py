@@ -24,6 +24,7 @@ _HARMONIC_SIZE = 32  # edge of the visibility's faces in texels: enough for low 
 _STEPS = 4  # number of intervals of a harmonic table for each interval of a lobe table
 _VARYING = 0.02  # error of harmonic tables over roughness
 _MATTE_TEXELS = 32  # factor on the number of single texels of Lambertian parts
+_WIDE = 2  # most places along the edge of a bright texel for the roughest material that has cells
 _PAIRS = 256  # pairs of directions at which BRDFs are tried
 _HALF = {"normal_texture": "turn highlights by half of its angle, and diffuse light not at all"}
 
@@ -429,18 +430,28 @@ def _bright(system: System, visible: Any, shading: Shading, texels: int, size: i
     if not texels:
         return system
     samples = samples_of(shading, size)
-    wide = cells and samples == 1  # narrower lobes read light and visibility within a cell
-    return bright_texels.BrightTexels(system, visible, shading.brdf, count=texels, samples=samples, cells=wide)
+    # Lobes narrower than cells read light and visibility within them.
+    by_lobes = (
+        cells and samples > 1 and isinstance(system, lobe.LobeSystem) and samples_of(shading, size, end=-1) <= _WIDE
+    )
+    options = {"samples": samples, "cells": (cells and samples == 1) or by_lobes, "by_lobes": by_lobes}
+    return bright_texels.BrightTexels(system, visible, shading.brdf, count=texels, **options)
 
 
-def samples_of(shading: Shading, size: int) -> int:
-    """Number of points along the edge of a bright texel at which the BRDF of a part is evaluated."""
+def samples_of(shading: Shading, size: int, *, end: int = 0) -> int:
+    """Number of points along the edge of a bright texel at which the BRDF of a part is evaluated.
+
+    Args:
+        shading: The part.
+        size: Edge of the light's faces in texels.
+        end: 0 for its smallest roughness, -1 for its largest one.
+    """
     if shading.matte:
         return 1
     if shading.table is not None:
-        return shading.table.samples(shading.smoothest, size)
-    sharpest: Callable = shading.brdf(jnp.asarray(shading.knot[0][0])) if shading.knot else shading.brdf
-    return bright_texels.samples_for(sharpest, size=size)
+        return shading.table.samples(shading.roughest if end else shading.smoothest, size)
+    chosen: Callable = shading.brdf(jnp.asarray(shading.knot[0][end])) if shading.knot else shading.brdf
+    return bright_texels.samples_for(chosen, size=size)
 
 
 def lobe_table(shading: Shading, lobes: int, *, system: System | None = None) -> lobe.LobeBrdf:

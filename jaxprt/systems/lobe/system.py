@@ -15,7 +15,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxprt import require
 from jaxprt.compile import isolated, jit, promoted, total
@@ -34,6 +34,7 @@ from jaxprt.systems.protocol import Blend
 _LEAST = 1e-3  # smallest visibility by which the shift of a lobe is divided
 _FARTHEST = 2.5  # largest shift of the mean of the visible part, in standard deviations
 _TINY = 1e-12
+_WIDE = 0.05  # standard deviation of the narrowest wide lobes: a quarter of the edge of a cell of 6 x 8 x 8
 _FLANK = 0.55  # spread of a lobe whose flanks, at 50 degrees, are as steep as those of a cosine
 
 
@@ -48,6 +49,8 @@ class LobeView(eqx.Module):
         vector: Transfer vectors of the vertices, for the diffuse part; no rows if the light holds the irradiance.
         points: Points that the view belongs to.
         size: Edge of the environment's cubemap faces in texels.
+        mean: Unit directions of the lobes in local frames; None if wide lobes do not read a light of their own.
+        concentration: Their concentrations.
     """
 
     place: tuple[Int[Array, "l v"], ...]
@@ -57,6 +60,8 @@ class LobeView(eqx.Module):
     vector: UInt8[Array, "h _"] | Float[Array, "h _"]
     points: Points
     size: int = eqx.field(static=True)
+    mean: Float[Array, "3 l v"] | None = None
+    concentration: Float[Array, "l v"] | None = None
 
 
 class LobeSystem(protocol.VertexSystem):
@@ -85,6 +90,16 @@ class LobeSystem(protocol.VertexSystem):
         """The light, blurred by lobes of about a dozen widths."""
         return prefilter(protocol.one_light(environment, size=self.transport.size))
 
+    def two_lights(self, narrow: Environment, wide: Environment) -> LobeLight:
+        """A light of which lobes that `is_wide` read another one than narrow lobes and the diffuse part.
+
+        Args:
+            narrow: The light.
+            wide: The light of wide lobes.
+        """
+        first, second = self.light(narrow), self.light(wide)
+        return dataclasses.replace(first, pyramid=jnp.concatenate([first.pyramid, second.pyramid], 1))
+
     def shade(self, light: LobeLight, materials: Blend | None = None) -> LobeLight:
         """The light with the irradiance of the vertices, for the diffuse part. Materials do not change it."""
         require.kind("the light", light, LobeLight, source="LobeSystem.light")
@@ -103,13 +118,14 @@ class LobeSystem(protocol.VertexSystem):
         points: Points = VERTICES,
         *,
         variance: Float[Array, " p"] | None = None,
+        two_lights: bool = False,
     ) -> LobeView:
         """Texels at which each point reads the blurred light, with visibility.
 
-        `variance`, in squared radians, widens the lobes of each point.
+        `variance`, in squared radians, widens the lobes of each point. With `two_lights` the view is of such a light.
         """
         protocol.check_blend(materials)
-        options = {"eye": eye, "points": points, "variance": variance}
+        options = {"eye": eye, "points": points, "variance": variance, "two_lights": two_lights}
         # The irradiance comes with the light: each row of points would hold a copy of the vectors.
         transport = eqx.tree_at(lambda stored: stored.vector, self.transport, self.transport.vector[:0])
         if materials is None:
@@ -130,6 +146,14 @@ class LobeSystem(protocol.VertexSystem):
         if light.irradiance is None:
             light = self.shade(light)
         return combine(light, view)
+
+    def wide_lobes(self, view: LobeView) -> LobeMixture:
+        """The lobes of a view of two lights, in local frames, with weights of 0 for narrow ones and diffuse parts."""
+        mean, concentration = view.mean, view.concentration
+        if mean is None or concentration is None:
+            raise ValueError("the view must be of two lights, got one of one light")
+        wide = jnp.where(is_wide(concentration), view.weight, 0)
+        return LobeMixture(mean, concentration, wide, jnp.zeros_like(view.diffuse))
 
     def diffuse_albedo(self, view: LobeView) -> Float[Array, "v c"]:
         """Albedo of the diffuse part: `System.diffuse_albedo`."""
@@ -190,6 +214,7 @@ def view_lobes(
     eye: Float[Array, "*p 3"],
     points: Points = VERTICES,
     variance: Float[Array, " p"] | None = None,
+    two_lights: bool = False,
 ) -> LobeView:
     """Finds the texels of the blurred light that each vertex or point reads for a view, and their visibility.
 
@@ -201,14 +226,15 @@ def view_lobes(
         points: Points at which radiance is evaluated; by default the vertices.
         variance: Variance in squared radians, along one axis, by which the lobes of each point are widened; None for
             zero.
+        two_lights: Whether wide lobes read a light of their own; see `LobeSystem.two_lights`.
     """
     count = len(transport.position)
     protocol.check_points(points, count)
     eye = require.position("the eye", eye, points=points.count(count))
-    return _view_lobes(transport, brdf, parameter, eye, points, variance)
+    return _view_lobes(transport, brdf, parameter, eye, points, variance, two_lights=two_lights)
 
 
-@jit
+@partial(jit, static_argnames=("two_lights",))
 def _view_lobes(
     transport: LobeTransport,
     brdf: LobeBrdf,
@@ -216,12 +242,24 @@ def _view_lobes(
     eye: Array,
     points: Points,
     variance: Array | None,
+    *,
+    two_lights: bool,
 ) -> LobeView:
     placing = *placed(transport.position, transport.frame, points), brdf, eye, variance
     lobe, (face, s, t, spread) = _places(*placing, *parameter)
     seen = transport.lobe_visibility(face, s, t, spread, points)
     place, visible = _taps(face, s, t, spread, lobe.concentration, seen, size=transport.size)
-    return LobeView(place, visible, lobe.weight, lobe.diffuse, transport.vector, points, transport.size)
+    view = LobeView(place, visible, lobe.weight, lobe.diffuse, transport.vector, points, transport.size)
+    if not two_lights:
+        return view
+    after = jnp.where(is_wide(lobe.concentration), scales(transport.size).total, 0)
+    place = tuple(texel + after for texel in place)
+    return dataclasses.replace(view, place=place, mean=lobe.mean, concentration=lobe.concentration)
+
+
+def is_wide(concentration: Float[Array, "*b"]) -> Bool[Array, "*b"]:
+    """Whether lobes are wide enough to represent the widest cells of the light as lobes too."""
+    return concentration < _WIDE**-2
 
 
 @isolated

@@ -9,13 +9,12 @@ directions of variance s, is nearly one of concentration 1 / (1 / k + s).
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jaxprt.compile import jit, total
+from jaxprt.compile import jit
 from jaxprt.scene.points import Points
-from jaxprt.sphere import cubemap, directions
-from jaxprt.systems.bright_texels import FULL, BrightLight, BrightTexels
+from jaxprt.sphere import directions
+from jaxprt.systems.bright_texels import FULL, BrightLight, BrightTexels, radiance_by_lobes
 from jaxprt.systems.lobe.table import LobeMixture
 from jaxprt.systems.protocol import Blend, System
 
@@ -56,7 +55,8 @@ def view(
     inner: Any = system.system if isinstance(system, BrightTexels) else system
     position, frame = lobes.placed(points)
     lobe = lobes.brdf.lookup(directions.view(frame, position, eye), *(() if blend is None else blend.parameter))
-    rest = inner.view(eye, blend, points, variance=variance)
+    options = {"two_lights": True} if isinstance(system, BrightTexels) and system.by_lobes else {}
+    rest = inner.view(eye, blend, points, variance=variance, **options)
     looked = rest if inner is lobes else rest.lobes
     lobe = LobeMixture(lobe.mean, lobe.concentration, looked.weight, looked.diffuse).widened(variance)
     return WidenedView(rest, lobe, frame)
@@ -74,24 +74,10 @@ def combine(system: Any, light: PyTree, seen: WidenedView, points: Points) -> Fl
     """
     if not isinstance(light, BrightLight):
         return system.combine(light, seen.rest, points)
-    sent, first = system.system.combine(light.rest, seen.rest, points), 0
+    sent = system.system.combine(light.rest, seen.rest, points)
     shares: Any = light.seen
-    frame = jnp.moveaxis(seen.frame, 0, 2)
-    for edge, count, _ in system.squares:
-        rows = slice(first, first + count)
-        direction, area = (
-            quantity(size=edge).reshape(-1, 3)[light.texel[rows]].astype(frame.dtype)
-            for quantity in (cubemap.direction, cubemap.vector_area)
-        )
-        # A texel or cell is a lobe itself, as wide as it is.
-        lobe = seen.lobe.widened(jnp.full(seen.frame.shape[0], 4 * jnp.pi / (6 * edge**2 * 12), frame.dtype))
-
-        def lit(texel: tuple[Array, Array, Array, Array], lobe: LobeMixture = lobe) -> Float[Array, "c v"]:
-            direction, area, excess, visible = texel
-            share = points.carry(visible.astype(frame.dtype) / FULL)
-            wi = jnp.sum(frame * direction[:, None], 1).T
-            return lobe.evaluate(wi) * jnp.linalg.norm(area) * share * excess[:, None]
-
-        sent = sent + total(lit, (direction, area, light.excess[rows], shares[rows])).T
-        first += count
-    return sent
+    texels, squares = (light.texel, light.excess / FULL, shares), system.squares
+    if system.by_lobes:
+        sent = sent + system.over_cells(light, seen.rest, seen.frame, shares, points)
+        texels, squares = tuple(rows[: system.count] for rows in texels), squares[:1]
+    return sent + radiance_by_lobes(seen.lobe, seen.frame, texels, points, squares=squares)
