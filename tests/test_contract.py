@@ -648,6 +648,21 @@ EXAMPLES = {
             draw.uniform(4, low=0.01, high=0.5),
         )
     ),
+    "systems.lobe.squares.radiance": example(
+        lambda draw: call(
+            lobe_system.table.LobeMixture(
+                draw.array(np.moveaxis(np.asarray(draw.upper(2, 3)), -1, 0)),
+                draw.uniform(2, 3, low=1, high=30),
+                draw.uniform(3, 2, 3),
+                draw.uniform(3, 3),
+            ),
+            draw.rotation(3),
+            (draw.integer(24, 5), draw.uniform(5, 3), draw.uniform(5, 3)),
+            Points(jnp.array([[0, 1, 2], [1, 2, 0]]), jnp.full((2, 3), 0.5)),
+        ),
+        squares=((2, 3, 1), (2, 2, 1)),
+        gradient=(),
+    ),
     "systems.lobe.diffuse.coefficients": example(lambda draw: call(draw.normal(6, 8, 8, 3))),
     "systems.lobe.diffuse.irradiance": example(lambda draw: call(draw.normal(8, 3), draw.normal(8, 5))),
     "systems.lobe.blurred_light.prefilter": example(lambda draw: call(draw.light(8))),

@@ -429,12 +429,12 @@ def _bright(system: System, visible: Any, shading: Shading, texels: int, size: i
     texels = min(texels, 6 * size * size - 1)
     if not texels:
         return system
-    samples = samples_of(shading, size)
+    samples, cells = samples_of(shading, size), cells and size > bright_texels.WIDEST
     # Lobes narrower than cells read light and visibility within them.
-    by_lobes = (
-        cells and samples > 1 and isinstance(system, lobe.LobeSystem) and samples_of(shading, size, end=-1) <= _WIDE
-    )
-    options = {"samples": samples, "cells": (cells and samples == 1) or by_lobes, "by_lobes": by_lobes}
+    by_lobes = cells and samples > 1
+    if by_lobes:
+        cells = isinstance(system, lobe.LobeSystem) and samples_of(shading, size, end=-1) <= _WIDE
+    options = {"samples": samples, "cells": cells, "by_lobes": by_lobes and cells}
     return bright_texels.BrightTexels(system, visible, shading.brdf, count=texels, **options)
 
 

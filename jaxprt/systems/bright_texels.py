@@ -11,7 +11,7 @@ where box_j is 1 in cell j and 0 elsewhere, v_j is the visible share of the cell
 import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
-from functools import partial, reduce
+from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -23,12 +23,10 @@ from jaxtyping import Array, ArrayLike, Float, Int, PyTree, UInt8
 from jaxprt import require
 from jaxprt.brdf import grid
 from jaxprt.compile import TOGETHER, jit, mapped, total
-from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import VERTICES, Points, placed
 from jaxprt.sphere import cubemap, directions
 from jaxprt.systems import adaptive, protocol
-from jaxprt.systems.lobe.table import LobeMixture
 from jaxprt.systems.protocol import Blend, System, VertexSystem
 from jaxprt.visibility.picture_rays import FULL
 
@@ -37,7 +35,7 @@ _ROW = 32  # texels per row, of which only the brightest is sorted at first
 _PLANS = {32: 64, 8: 32}, {16: 64, 8: 64}, {8: 64}
 _JUMP, _WITHIN = 16, 0.1  # edge of the means whose steps lobes cannot follow, and what steps within them count
 _WIDE = 4  # edge of the means about which steps are counted
-_WIDEST = 8  # edge of a face in the largest cells
+WIDEST = 8  # edge of a face in the largest cells
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
 _TOGETHER = 32  # texels whose visibility is read at once
 _value = jit(adaptive.value)
@@ -127,8 +125,9 @@ class BrightTexels(VertexSystem):
             the material.
         cells: Whether cells of the light are summed too. The visibility must have their shares, as that of
             `jaxprt.lobe.precompute` does.
-        by_lobes: Whether wide lobes of the system, one of lobes, are integrated over cells, and narrow ones read the
-            light with them, for BRDFs that have lobes narrower than cells; otherwise the BRDF is evaluated there.
+        by_lobes: Whether wide lobes and diffuse parts of the system, one of lobes, are integrated over cells, and
+            narrow ones read the light with them, for BRDFs that have lobes narrower than cells; otherwise the BRDF is
+            evaluated there.
     """
 
     system: System
@@ -170,7 +169,12 @@ class BrightTexels(VertexSystem):
         samples = 1 if self.by_lobes else samples
         wide = samples if samples == 1 else 2 * samples
         counts = _cell_counts(size).items()
-        return texels, *(Squares(edge, count, wide if edge == _WIDEST else samples) for edge, count in counts)
+        return texels, *(Squares(edge, count, wide if edge == WIDEST else samples) for edge, count in counts)
+
+    @property
+    def parts(self) -> tuple[slice, slice]:
+        """The texels and the cells among both."""
+        return slice(self.count), slice(self.count, None)
 
     def shade(self, light: BrightLight, materials: PyTree = None) -> BrightLight:
         """Light of the rest that arrives at the vertices, and what they see of the bright texels."""
@@ -208,26 +212,12 @@ class BrightTexels(VertexSystem):
         points = points if light.here is None else VERTICES
         texels, squares = (light.texel, light.excess / FULL, shares), self.squares
         if self.by_lobes:
-            rest = rest + self.over_cells(light, view.rest, view.frame, shares, points)
-            texels, squares = tuple(rows[: self.count] for rows in texels), squares[:1]
+            lobes: Any = self.system
+            texels, cells = (tuple(rows[part] for rows in texels) for part in self.parts)
+            rest = rest + lobes.over_cells(view.rest, view.frame, cells, points, squares=squares[1:])
+            squares = squares[:1]
         brdf = grid.as_argument(self.brdf)
         return rest + texel_radiance(brdf, view.frame, view.wo, texels, points, view.blend, squares=squares)
-
-    def over_cells(
-        self, light: BrightLight, rest: PyTree, frame: Array, shares: Array, points: Points
-    ) -> Float[Array, "p c"]:
-        """Radiance that wide lobes reflect from cells.
-
-        Args:
-            light: The light.
-            rest: The view of the underlying system.
-            frame: Shading frames of the vertices or points; rows are tangent, bitangent, normal.
-            shares: Visible shares of the texels and cells, in 240ths.
-            points: Points to which the shares are interpolated.
-        """
-        lobes: Any = self.system
-        cells = tuple(rows[self.count :] for rows in (light.texel, light.excess / FULL, shares))
-        return radiance_by_lobes(lobes.wide_lobes(rest), frame, cells, points, squares=self.squares[1:])
 
     def _diffuse(self, flux: Float[Array, "c 4 v"], view: BrightView, points: Points) -> Float[Array, "c _"]:
         """Irradiance / pi by the bright texels: max(F . n + max(E - F . m, 0), 0)."""
@@ -602,52 +592,6 @@ def texel_radiance(
     area = jnp.where((real < len(number))[:, None], area[index], 0)
     rows = direction[index].astype(excess.dtype), area.astype(excess.dtype), number[index]
     return total(lit, rows, counts=counts).T
-
-
-@partial(jit, static_argnames=("squares",))
-def radiance_by_lobes(
-    lobe: LobeMixture,
-    frame: Float[Array, "p 3 3"],
-    light: tuple[Int[Array, " t"], Float[Array, "t c"], UInt8[Array, "t v"] | Float[Array, "t v"]],
-    points: Points,
-    *,
-    squares: tuple[Squares, ...],
-) -> Float[Array, "p e"]:
-    """Radiance by texels or cells that are treated as lobes as wide as they are: `texel_radiance` of a BRDF's lobes.
-
-    Args:
-        lobe: Lobes of BRDF x cosine at the points, in local frames.
-        frame: Shading frames; rows are tangent, bitangent, normal.
-        light: Indices of the texels or cells, their radiance, and their visible share at the vertices.
-        points: Points to which the shares are interpolated; all vertices for shares of the points themselves.
-        squares: Size and number of the texels or cells, in their order.
-    """
-    axes, first, parts = jnp.moveaxis(frame, 0, 2), 0, []
-    reflects = jnp.any(lobe.weight != 0) | jnp.any(lobe.diffuse != 0)
-    for edge, count, _ in squares:
-        texel, excess, visible = (rows[first : first + count] for rows in light)
-        first += count
-        direction, area = (
-            quantity(size=edge).reshape(-1, 3)[texel].astype(frame.dtype)
-            for quantity in (cubemap.direction, cubemap.vector_area)
-        )
-        wide = lobe.widened(jnp.full(len(frame), 4 * np.pi / (6 * edge**2 * 12), frame.dtype))
-        peak = wide.weight * jnp.exp(mixture.log_peak(wide.concentration))
-
-        def lit(row: tuple[Array, ...], wide: LobeMixture = wide, peak: Array = peak) -> Float[Array, "c v"]:
-            direction, flux, visible = row
-            wi = [_component(axis, direction) for axis in axes]
-            away = reduce(jnp.add, ((each - mean) ** 2 for each, mean in zip(wi, wide.mean, strict=True))) / 2
-            value = jnp.sum(peak * jnp.exp(-wide.concentration * away), 1) + wide.diffuse * wi[2] / np.pi
-            share = points.carry(visible.astype(frame.dtype))
-            return jnp.where(wi[2] > 0, value * share, 0) * flux[:, None]
-
-        def counts(rows: tuple[Array, ...]) -> Array:
-            return reflects & jnp.any(rows[1] != 0)
-
-        rows = direction, excess * jnp.linalg.norm(area, axis=1, keepdims=True), visible
-        parts.append(total(lit, rows, counts=None if count % TOGETHER else counts).T)
-    return reduce(jnp.add, parts)
 
 
 @partial(jit, static_argnames=("numbers",))

@@ -115,17 +115,24 @@ def glossy():
     return ready, Environment(jnp.asarray(radiance, jnp.float32))
 
 
-def test_soft_boxes_are_hidden_where_they_are_between_vertices(glossy):
+@pytest.fixture(scope="module")
+def off(glossy):
+    """The error of a picture of the floor in the soft boxes, relative to the norm."""
     ready, light = glossy
-    rays, vertices = (np.asarray(ready.picture(light, shadows=way)) for way in ("rays", "vertices"))
     exact = exact_pixels(ready.scene, ready.shading, [light], CAMERA, pixels=300)
+    assert exact.error[0] < 0.004
 
-    def off(picture):
+    def measure(picture):
         there = exact.part == 0
-        wrong = picture.reshape(-1, 3)[exact.pixel] - exact.color[0]
+        wrong = np.asarray(picture).reshape(-1, 3)[exact.pixel] - exact.color[0]
         return np.linalg.norm(wrong[there]) / np.linalg.norm(exact.color[0][there])
 
-    assert exact.error[0] < 0.004
+    return measure
+
+
+def test_soft_boxes_are_hidden_where_they_are_between_vertices(glossy, off):
+    ready, light = glossy
+    rays, vertices = (ready.picture(light, shadows=way) for way in ("rays", "vertices"))
     assert off(rays) < 0.015
     assert off(vertices) > 0.07
     view = ready.picture_view()
@@ -151,13 +158,24 @@ def test_pictures_with_rays_to_cells_have_derivatives_by_materials(glossy):
     np.testing.assert_allclose(jax.grad(total)(0.8), difference, rtol=1e-2)
 
 
-def test_groups_of_rough_parts_have_cells(glossy):
-    ready, _ = glossy
+def test_rough_parts_have_cells_also_beside_smooth_ones_but_these_alone_have_none(glossy, off):
+    ready, light = glossy
     floor, bar = ready.scene.parts
-    smooth = dataclasses.replace(bar, material=TexturedMaterial(metallic=1.0, roughness=0.3))
-    mixed = prt.precompute(Scene([floor, smooth]), refine=False, system=Lobes(4, 4), size=16, progress=False)
-    assert [group.system.cells for group in ready.surfaces] == [True]
-    assert [group.system.cells for group in mixed.surfaces] == [False]
+    assert [(group.system.cells, group.system.by_lobes) for group in ready.surfaces] == [(True, False)]
+
+    def made(*parts):
+        return prt.precompute(Scene(list(parts)), refine=False, system=Lobes(12, 4), size=16, progress=False)
+
+    smooth = TexturedMaterial(metallic=1.0, roughness=0.1)
+    mixed = made(floor, dataclasses.replace(bar, material=smooth))
+    assert [(group.system.cells, group.system.by_lobes) for group in mixed.surfaces] == [(True, True)]
+    assert off(mixed.picture(light, CAMERA)) < 0.02
+    alone = made(dataclasses.replace(floor, material=smooth))
+    assert [group.system.cells for group in alone.surfaces] == [False]
+    (group,) = mixed.surfaces
+    without = dataclasses.replace(group.system, cells=False, by_lobes=False)
+    plain = prt.RelitScene(mixed.scene, mixed.shading, mixed.layout, [without])
+    assert off(plain.picture(light, CAMERA)) > 0.06
 
 
 @pytest.mark.usefixtures("unchecked")

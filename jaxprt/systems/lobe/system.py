@@ -25,6 +25,7 @@ from jaxprt.scene.points import VERTICES, Points, placed
 from jaxprt.sphere import cubemap, directions
 from jaxprt.systems import harmonic, protocol
 from jaxprt.systems.lobe import diffuse
+from jaxprt.systems.lobe import squares as over_squares
 from jaxprt.systems.lobe.blurred_light import LobeLight, prefilter, scales
 from jaxprt.systems.lobe.exported import DEGREE, CoarseTransport, ExportedLobes
 from jaxprt.systems.lobe.pyramid import LobeTransport, between, corners
@@ -91,14 +92,14 @@ class LobeSystem(protocol.VertexSystem):
         return prefilter(protocol.one_light(environment, size=self.transport.size))
 
     def two_lights(self, narrow: Environment, wide: Environment) -> LobeLight:
-        """A light of which lobes that `is_wide` read another one than narrow lobes and the diffuse part.
+        """A light of which narrow lobes read another one than wide lobes and the diffuse part.
 
         Args:
-            narrow: The light.
-            wide: The light of wide lobes.
+            narrow: The light of narrow lobes.
+            wide: The light of wide lobes and the diffuse part.
         """
         first, second = self.light(narrow), self.light(wide)
-        return dataclasses.replace(first, pyramid=jnp.concatenate([first.pyramid, second.pyramid], 1))
+        return dataclasses.replace(second, pyramid=jnp.concatenate([first.pyramid, second.pyramid], 1))
 
     def shade(self, light: LobeLight, materials: Blend | None = None) -> LobeLight:
         """The light with the irradiance of the vertices, for the diffuse part. Materials do not change it."""
@@ -147,13 +148,30 @@ class LobeSystem(protocol.VertexSystem):
             light = self.shade(light)
         return combine(light, view)
 
-    def wide_lobes(self, view: LobeView) -> LobeMixture:
-        """The lobes of a view of two lights, in local frames, with weights of 0 for narrow ones and diffuse parts."""
+    def over_cells(
+        self,
+        view: LobeView,
+        frame: Float[Array, "p 3 3"],
+        cells: tuple[Array, Array, Array],
+        points: Points,
+        *,
+        squares: tuple[tuple[int, int, int], ...],
+    ) -> Float[Array, "p c"]:
+        """Radiance that wide lobes and the diffuse part reflect from cells that are not in their light.
+
+        Args:
+            view: A view of two lights.
+            frame: Shading frames of the points; rows are tangent, bitangent, normal.
+            cells: Indices of the cells, their radiance and their visible share; see `squares.radiance`.
+            points: Points to which the shares are interpolated.
+            squares: Edge of a face in cells, and number of them.
+        """
         mean, concentration = view.mean, view.concentration
         if mean is None or concentration is None:
             raise ValueError("the view must be of two lights, got one of one light")
-        wide = jnp.where(is_wide(concentration), view.weight, 0)
-        return LobeMixture(mean, concentration, wide, jnp.zeros_like(view.diffuse))
+        wide = jnp.where(_is_wide(concentration), view.weight, 0)
+        lobe = LobeMixture(mean, concentration, wide, view.diffuse)
+        return over_squares.radiance(lobe, frame, cells, points, squares=squares)
 
     def diffuse_albedo(self, view: LobeView) -> Float[Array, "v c"]:
         """Albedo of the diffuse part: `System.diffuse_albedo`."""
@@ -252,12 +270,12 @@ def _view_lobes(
     view = LobeView(place, visible, lobe.weight, lobe.diffuse, transport.vector, points, transport.size)
     if not two_lights:
         return view
-    after = jnp.where(is_wide(lobe.concentration), scales(transport.size).total, 0)
+    after = jnp.where(_is_wide(lobe.concentration), scales(transport.size).total, 0)
     place = tuple(texel + after for texel in place)
     return dataclasses.replace(view, place=place, mean=lobe.mean, concentration=lobe.concentration)
 
 
-def is_wide(concentration: Float[Array, "*b"]) -> Bool[Array, "*b"]:
+def _is_wide(concentration: Float[Array, "*b"]) -> Bool[Array, "*b"]:
     """Whether lobes are wide enough to represent the widest cells of the light as lobes too."""
     return concentration < _WIDE**-2
 

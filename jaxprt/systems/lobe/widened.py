@@ -14,7 +14,8 @@ from jaxtyping import Array, Float, PyTree
 from jaxprt.compile import jit
 from jaxprt.scene.points import Points
 from jaxprt.sphere import directions
-from jaxprt.systems.bright_texels import FULL, BrightLight, BrightTexels, radiance_by_lobes
+from jaxprt.systems.bright_texels import FULL, BrightLight, BrightTexels
+from jaxprt.systems.lobe import squares as over_squares
 from jaxprt.systems.lobe.table import LobeMixture
 from jaxprt.systems.protocol import Blend, System
 
@@ -78,6 +79,7 @@ def combine(system: Any, light: PyTree, seen: WidenedView, points: Points) -> Fl
     shares: Any = light.seen
     texels, squares = (light.texel, light.excess / FULL, shares), system.squares
     if system.by_lobes:
-        sent = sent + system.over_cells(light, seen.rest, seen.frame, shares, points)
-        texels, squares = tuple(rows[: system.count] for rows in texels), squares[:1]
-    return sent + radiance_by_lobes(seen.lobe, seen.frame, texels, points, squares=squares)
+        texels, cells = (tuple(rows[part] for rows in texels) for part in system.parts)
+        sent = sent + system.system.over_cells(seen.rest, seen.frame, cells, points, squares=squares[1:])
+        squares = squares[:1]
+    return sent + over_squares.radiance(seen.lobe, seen.frame, texels, points, squares=squares)

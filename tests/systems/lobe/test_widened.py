@@ -65,12 +65,13 @@ def test_unwidened_lobes_give_the_radiance_of_the_system(systems, close):
     assert np.linalg.norm(found - exact[1]) < LOBES * np.linalg.norm(exact[1])
 
 
-def test_cells_of_the_light_are_seen_by_widened_lobes_as_by_the_brdf():
+@pytest.mark.parametrize("by_lobes", [False, True])
+def test_cells_of_the_light_are_seen_by_widened_lobes_as_by_the_system(by_lobes):
     """At 6 x 16 x 16 texels, which have cells of 6 x 8 x 8."""
     brdf, light = CookTorrance(diffuse=[0.3, 0.2, 0.1], roughness=0.5), builtin.studio(size=16)
     stored = visibility.precompute(ball_on_ground(), size=16, run=Run(progress=False))
     system = lobe.LobeSystem(lobe.compress(stored), lobe.tabulate(brdf, lobes=6, resolution=16))
-    both = bright_texels.BrightTexels(system, system.transport, brdf, count=8, samples=2, cells=True)
+    both = bright_texels.BrightTexels(system, system.transport, brdf, count=8, samples=2, cells=True, by_lobes=by_lobes)
     exact = np.asarray(both.combine(both.shade(both.light(light)), both.view(EYE)))
     assert np.any(np.asarray(both.light(light).excess)[8:])
     assert np.linalg.norm(lit(both, light, 0.0) - exact) < CELLS * np.linalg.norm(exact)
