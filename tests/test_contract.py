@@ -632,7 +632,8 @@ EXAMPLES = {
         lambda draw: call(draw.uniform(5, low=2, high=90), draw.uniform(5, low=0.05, high=0.5))
     ),
     "systems.lamps.outline.solid_angle": example(lambda draw: call(draw.polygon())),
-    "systems.lamps.outline.vector_area": example(lambda draw: call(draw.polygon())),
+    "systems.lamps.outline.above_horizon": example(lambda draw: call(draw.polygon())),
+    "systems.lamps.outline.disk": example(lambda draw: call(draw.polygon())),
     "systems.lamps.outline.lobe_integral": example(
         lambda draw: call(
             draw.array(np.moveaxis(np.asarray(draw.upper(2, 4)), -1, 0)),

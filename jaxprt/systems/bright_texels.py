@@ -143,6 +143,8 @@ class BrightTexels(VertexSystem):
         source = "jaxprt.lobe.precompute" if self.cells else "precompute of jaxprt.visibility or jaxprt.lobe"
         require.kind("the system", self.system, System, source="jaxprt.lobe.LobeSystem or another system")
         require.kind("the visibility", self.visibility, CellVisibility if self.cells else Visibility, source=source)
+        if self.by_lobes and not (self.cells and self.system.lobe_part is self.system):
+            raise ValueError("by_lobes must be with cells and a system of lobes, as from jaxprt.lobe.LobeSystem")
         require.length("vertices of the visibility", self.visibility.position, self.system.vertices)
 
     def light(self, environment: Environment) -> BrightLight:
@@ -278,7 +280,7 @@ class BrightTexels(VertexSystem):
 
     @property
     def shared_light(self) -> tuple | None:
-        """Key of the light: that of the underlying system, with the number of texels and whether there are cells."""
+        """Key of the light: that of the underlying system, with the number of texels and the kind of cells."""
         rest = self.system.shared_light
         return rest and (BrightTexels, self.count, self.cells, self.by_lobes, rest)
 

@@ -352,6 +352,8 @@ def test_cells_need_faces_of_a_power_of_two_and_visibility_that_has_them(mesh, t
     nothing = harmonic.DiffuseSystem(harmonic.precompute_diffuse(mesh, size=SIZE), jnp.zeros(3))
     with pytest.raises(TypeError, match=r"which jaxprt\.lobe\.precompute makes"):
         bright_texels.BrightTexels(nothing, transport, GLOSSY, cells=True)
+    with pytest.raises(ValueError, match="by_lobes must be with cells and a system of lobes"):
+        bright_texels.BrightTexels(nothing, transport, GLOSSY, by_lobes=True)
 
 
 def test_smoother_materials_sum_more_places_of_a_cell(mesh):

@@ -29,6 +29,7 @@ _STRAIGHT = 1e-6  # area that a corner adds, relative to that of the polygon, be
 _REACH = 3.5  # distance along an edge from which on all of a lobe is nearer, in standard deviations
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 _SMALL = 0.02
+_SHORT = 3e-7  # length of edges, in radians, that may be rounding
 _TINY = 1e-12
 
 
@@ -84,7 +85,7 @@ def _of(lamp: Mesh) -> Float[np.ndarray, "k 3"] | None:
         if adds.min() > _STRAIGHT * whole:
             break
         number.pop(int(np.argmin(adds)))
-    if len(number) > _CORNERS or hull.volume > (1 + _FLAT) * whole:
+    if len(number) > _CORNERS or abs(hull.volume - whole) > _FLAT * whole:  # or triangles that overlap
         return None
     return corner[area > 0].reshape(-1, 3)[number]
 
@@ -95,7 +96,8 @@ def _cut(
     """Pieces of equal area of an outline, cut about as places on it are: by halving across the longest extent."""
     if count == 1:
         return [outline]
-    axis, half = int(np.argmax(np.ptp(place, axis=0))), len(place) // 2
+    extent, half = np.ptp(place, axis=0), len(place) // 2
+    axis = int(np.argmax(extent if extent.any() else np.ptp(outline, axis=0)))
     along, area = outline[:, axis], _area(outline)
     middle = scipy.optimize.brentq(
         lambda height: _area(_below(outline, along - height)) - area / 2, along.min(), along.max()
@@ -144,29 +146,56 @@ def solid_angle(corner: Float[Array, "k 3 v"]) -> Float[Array, " v"]:
     Reference: Van Oosterom, Strackee, "The solid angle of a plane triangle", 1983.
     """
     start, second, third = corner[:1], corner[1:-1], corner[2:]
-    triple = jnp.sum(start * jnp.stack(_cross(*(jnp.moveaxis(at, 1, 0) for at in (second, third))), 1), 1)
+    # Differences keep the digits of small polygons.
+    beyond = jnp.stack(_cross(*(jnp.moveaxis(at - start, 1, 0) for at in (second, third))), 1)
     beside = 1 + sum(jnp.sum(a * b, 1) for a, b in ((start, second), (second, third), (third, start)))
-    return jnp.sum(2 * jnp.arctan2(triple, beside), 0)
+    return jnp.sum(2 * jnp.arctan2(jnp.sum(start * beyond, 1), beside), 0)
 
 
 @jit
-def vector_area(corner: Float[Array, "k 3 v"]) -> Float[Array, "3 v"]:
-    """Integrals of the unit direction over convex polygons on the sphere.
+def disk(corner: Float[Array, "k 3 v"]) -> tuple[list[Array], Float[Array, " v"]]:
+    """Direction of the middle of small polygons on the sphere, and squared chord of a disk of the same variance.
+
+    Args:
+        corner: Unit directions of the corners.
+    """
+    start = corner[:1]
+    sides = [jnp.moveaxis(at - start, 1, 0) for at in (corner[1:-1], corner[2:])]
+    area = jnp.sqrt(jnp.maximum(sum(axis**2 for axis in _cross(*sides)), _TINY**3))
+    share = area / jnp.sum(area, 0)
+    middle = [at + jnp.sum(share * (a + b) / 3, 0) for at, a, b in zip(corner[0], *sides, strict=True)]
+    ends = [[at - place for at in (corner[0, i], corner[1:-1, i], corner[2:, i])] for i, place in enumerate(middle)]
+    square = sum(sum(at**2 for at in axis) + sum(axis) ** 2 for axis in ends) / 12
+    length = jnp.sqrt(jnp.maximum(sum(axis**2 for axis in middle), _TINY))
+    return [axis / length for axis in middle], 2 * jnp.sum(share * square, 0)
+
+
+@jit
+def above_horizon(corner: Float[Array, "k 3 v"]) -> Float[Array, "n 3 v"]:
+    """The parts of convex polygons above the horizon, z = 0: twice as many corners, of which some coincide.
 
     Args:
         corner: Unit directions of the corners, counterclockwise.
-
-    Reference: Arvo, "Applications of irradiance tensors to the simulation of non-Lambertian phenomena", 1995.
     """
-    normal, angle = _edges(corner, jnp.roll(corner, -1, 0))
-    return jnp.sum(normal * angle[:, None] / 2, 0)
+    after = jnp.roll(corner, -1, 0)
+    low, high = corner[:, 2:], after[:, 2:]
+    down, up = (low >= 0) & (high < 0), (low < 0) & (high >= 0)
+    crosses = down | up
+    point = corner + low / jnp.where(crosses, low - high, 1) * (after - corner)
+    point = point * jnp.array([[1], [1], [0]], corner.dtype)
+    point = point / jnp.sqrt(jnp.maximum(jnp.sum(point**2, 1, keepdims=True), _TINY))
+    # Corners below the horizon lie where the outline goes below. Polygons that are below lie in one direction.
+    none = jnp.array([[1], [0], [0]], corner.dtype)
+    left = jnp.where(jnp.any(down, 0), jnp.sum(jnp.where(down, point, 0), 0), none)
+    kept = jnp.where(low >= 0, corner, left)
+    return jnp.stack([kept, jnp.where(crosses, point, kept)], 1).reshape(-1, *corner.shape[1:])
 
 
 @jit
 def lobe_integral(
     mean: Float[Array, "3 l v"], concentration: Float[Array, "l v"], corner: Float[Array, "k 3 v"]
 ) -> Float[Array, "l v"]:
-    """Integrals of von Mises-Fisher lobes over convex polygons on the sphere, to about 1e-3.
+    """Integrals of von Mises-Fisher lobes over convex polygons on the sphere, with an absolute error of about 1e-3.
 
     Args:
         mean: Unit directions of the lobes.
@@ -206,7 +235,7 @@ def lobe_integral(
     normal, angle = _edges(corner, jnp.roll(corner, -1, 0))
     inside = reduce(jnp.logical_and, (_dot(mean, side) >= 0 for side in normal))
     edges = corner, jnp.roll(corner, -1, 0), normal, angle
-    within = jnp.where(inside, 2 * np.pi, 0) + total(edge, edges)
+    within = jnp.where(inside & jnp.any(angle > 0, 0), 2 * np.pi, 0) + total(edge, edges)
     return jnp.clip(within / (-2 * np.pi * jnp.expm1(-2 * concentration)), 0, 1)
 
 
@@ -229,10 +258,12 @@ def _share(x: Array) -> Array:
 
 
 def _edges(start: Float[Array, "k 3 v"], end: Float[Array, "k 3 v"]) -> tuple[Array, Array]:
-    """Unit normals of the planes of edges, which point inside, and lengths of the edges."""
+    """Unit normals of the planes of edges, which point inside, and lengths of the edges; 0 for edges without length."""
     across, along = jnp.stack(_cross(jnp.moveaxis(start, 1, 0), jnp.moveaxis(end, 1, 0)), 1), jnp.sum(start * end, 1)
-    length = jnp.sqrt(jnp.maximum(jnp.sum(across**2, 1), _TINY**2))
-    return across / length[:, None], jnp.arctan2(length, along)
+    square = jnp.sum(across**2, 1)
+    long = square > _SHORT**2
+    length = jnp.sqrt(jnp.where(long, square, 1))
+    return jnp.where(long[:, None], across / length[:, None], 0), jnp.where(long, jnp.arctan2(length, along), 0)
 
 
 def _cross(first: Array, second: Array) -> tuple[Array, Array, Array]:

@@ -1,6 +1,6 @@
 """Reflected radiance of surfaces that are lit by lamps.
 
-Flat and convex lamps are polygons, over which integrals of lobes are exact (`jaxprt.systems.lamps.outline`). What hides
+Flat and convex lamps are polygons, over which lobes are integrated to .001 (`jaxprt.systems.lamps.outline`). What hides
 of them is the mean over their pieces, as far as each lobe sees these as other lobes.
 
 The visible part of another lamp is approximated by a disk on the sphere with the same mean direction d and the same
@@ -35,7 +35,7 @@ from jaxprt.brdf.models import color
 from jaxprt.compile import jit, total
 from jaxprt.scene.points import VERTICES, Points, placed
 from jaxprt.sphere import directions
-from jaxprt.systems.lamps.outline import lobe_integral, solid_angle, vector_area
+from jaxprt.systems.lamps.outline import above_horizon, disk, lobe_integral, solid_angle
 from jaxprt.systems.lamps.transport import LampTransport
 from jaxprt.systems.lobe import LobeBrdf
 from jaxprt.systems.lobe.table import LobeMixture, traced_share
@@ -44,9 +44,9 @@ from jaxprt.systems.protocol import Blend, check_blend
 _SMALL, _LARGE = 0.5, 2.0  # squared chords, in variances of the lobe, between which the two approximations blend
 _RATHER = np.log(9.0)  # the share of rays rises while the lamp's radius goes from 1 to 3 standard deviations
 _TINY = 1e-30
-_LEAST = 1e-9  # solid angle of pieces
-_FAR = 1e-12  # density of lobes far from a lamp
-_ALIKE = 0.02  # shares of pieces that differ less are one
+_LEAST = 1e-14  # solid angle of a lamp, below which it is seen edge-on or from behind
+_FAR = 1e-6  # density of lobes far from a lamp
+_ALIKE = 0.01  # difference of the shares of pieces up to which they count as one, and half of that from which as theirs
 
 
 class LitByLamps(eqx.Module):
@@ -223,23 +223,47 @@ def _reflect_flat(
     way = outline[..., None] - position.T
     local = jnp.stack([sum(way[:, :, j] * frame[:, i, j] for j in range(3)) for i in range(3)], 2)  # [q k 3 v]
     local = local / jnp.sqrt(jnp.maximum(jnp.sum(local**2, 2, keepdims=True), _TINY))
-    full = jnp.maximum(jax.vmap(solid_angle)(local[1:]), _LEAST)
-    visible, share = jnp.sum(solid, 0) / jnp.sum(full, 0), solid / full
+    low = jnp.any(local[:, :, 2] < 0)
+    filled = jax.lax.cond(
+        low, lambda: _filled(lobe, jax.vmap(above_horizon)(local), solid), lambda: _filled(lobe, local, solid)
+    )
+    return _sent(lobe, traced, whole, filled, jnp.sum(matte, 0))
+
+
+def _filled(lobe: LobeMixture, corner: Float[Array, "q k 3 v"], solid: Float[Array, "p v"]) -> Float[Array, "l v"]:
+    """Share of each lobe that the visible part of a flat lamp fills, by the corners of the lamp and of its pieces."""
+    full = jnp.maximum(jax.vmap(solid_angle)(corner[1:]), 0)
+    total_angle = jnp.sum(full, 0)
+    faces = total_angle > _LEAST
+    size = jnp.where(faces, total_angle, 1)
+    # What vertices see, interpolated, may be more than there is.
+    share = jnp.clip(jnp.where(full > 0, solid / jnp.where(full > 0, full, 1), 0), 0, 1)
+    visible = jnp.clip(jnp.sum(solid, 0) / size, 0, 1)
 
     def seen(row: tuple[Array, ...]) -> Array:
         corner, full, share = row
-        toward, chord = _disk(full, vector_area(corner))
-        part = (_as_lobes(lobe.mean, lobe.concentration, toward, chord)[0] + _FAR) * full
+        part = (_as_lobes(lobe.mean, lobe.concentration, *disk(corner))[0] + _FAR) * full / size
         return jnp.stack([part, part * share])
 
     def partly() -> Array:
-        part, lit = total(seen, (local[1:], full, share))
-        return lit / part
+        part, lit = total(seen, (corner[1:], full, share))
+        return jnp.where(faces, lit / jnp.where(faces, part, 1), 0)
 
-    alike = jnp.all(jnp.abs(share - visible) < _ALIKE)
-    shown = jax.lax.cond(alike, lambda: jnp.broadcast_to(visible, lobe.concentration.shape), partly)
-    filled = lobe_integral(lobe.mean, lobe.concentration, local[0]) * shown
-    return _sent(lobe, traced, whole, filled, jnp.sum(matte, 0))
+    apart = jnp.clip(jnp.max(jnp.abs(share - visible), 0) / _ALIKE - 1, 0, 1)
+    same = jnp.broadcast_to(visible, lobe.concentration.shape)
+    shown = jax.lax.cond(jnp.any(apart > 0), lambda: same + apart * (partly() - same), lambda: same)
+    # The integral over a polygon that is small beside the lobe is a difference of large terms.
+    toward, chord = disk(corner[0])
+    small = _as_lobes(lobe.mean, lobe.concentration, toward, chord)[0] * size
+    exact = lobe_integral(lobe.mean, lobe.concentration, corner[0])
+    share_of_exact = _smooth(lobe.concentration * chord)
+    return jnp.where(faces, (small + share_of_exact * (exact - small)) * shown, 0)
+
+
+def _smooth(size: Array) -> Array:
+    """Share of the approximation for large lamps, by their squared chord in variances of the lobe."""
+    share = jnp.clip((size - _SMALL) / (_LARGE - _SMALL), 0, 1)
+    return share**2 * (3 - 2 * share)
 
 
 def mean_density(mean: Array, concentration: Array, toward: Sequence[Array], chord: Array) -> Float[Array, "l v"]:
@@ -256,8 +280,7 @@ def mean_density(mean: Array, concentration: Array, toward: Sequence[Array], cho
     """
     small, apart = _as_lobes(mean, concentration, toward, chord)
     size = concentration * chord
-    share = jnp.clip((size - _SMALL) / (_LARGE - _SMALL), 0, 1)
-    share = share**2 * (3 - 2 * share)
+    share = _smooth(size)
     inside = _inside(jnp.maximum(size, _SMALL), concentration * apart)
     large = inside / (np.pi * jnp.maximum(chord, _SMALL / concentration))
     # Normalizes the normal distribution, which is cut off at a chord of 2.

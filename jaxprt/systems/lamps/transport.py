@@ -107,7 +107,7 @@ def precompute(
             near a lamp there are 16 times as many. Light is underestimated at vertices nearer to a lamp than about a
             hundredth of its width.
         pieces: Number of pieces into which each surface is cut, a power of two. Use more for lamps that look large
-            relative to the lobes of the BRDF.
+            relative to the lobes of the BRDF and are partly hidden, or neither flat nor convex.
         occluder: Mesh that casts shadows, such as the whole scene with or without the lamps; the mesh itself if None.
         vertex: Indices of the vertices to light, or a mask; all if None. The rest of the mesh still casts shadows.
         apart: Whether the regions of the mesh are separate surfaces: rays start off the faces of their own region.

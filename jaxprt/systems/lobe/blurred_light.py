@@ -36,7 +36,7 @@ class LobeLight(eqx.Module):
 
     Attributes:
         pyramid: Texels of all widths, one after another, in units of radiance; each face has a border of its neighbors'
-            texels.
+            texels. Those of wide lobes follow if these read a light of their own.
         coefficient: Coefficients of the unblurred light, for the diffuse part; see `jaxprt.systems.lobe.diffuse`.
         size: Edge of the environment's cubemap faces in texels.
         irradiance: Irradiance / pi of the vertices; None before `LobeSystem.shade`.

@@ -43,7 +43,8 @@ class LobeView(eqx.Module):
     """A view: the texels of the blurred light that each vertex reads, and their weights.
 
     Attributes:
-        place: Indices of texels of the blurred light, eight arrays with one texel for each lobe l.
+        place: Indices of texels of the blurred light, or of the second one of two, eight arrays with one texel for
+            each lobe l.
         visible: Weights of these texels: interpolation weight times visibility.
         weight: Weight of each lobe, gray or per color.
         diffuse: Albedo of the diffuse part, gray or per color.

@@ -214,11 +214,62 @@ def test_flat_convex_lamps_are_polygons_and_others_are_disks():
     corner = face[np.any(position[face].min(1)[:, [0, 2]] < -0.5, 1)]
     sheet = join([LAMP, square([0, HEIGHT, 0], SIDE, down=False)])
     bent = make_mesh(position + [0, 0.1, 0] * position[:, :1] ** 2, face)
-    for mesh in (nine, make_mesh(position, corner), sheet, bent, builtin.sphere(rings=8, sectors=16)):
+    twice = make_mesh(position, np.concatenate([corner, corner]))
+    for mesh in (nine, make_mesh(position, corner), twice, sheet, bent, builtin.sphere(rings=8, sectors=16)):
         assert flat_lamps(mesh) == ()
     both = lamps.precompute(GROUND, [BULB, sheet, LAMP], samples=16, run=QUIET)
     assert both.flat == (2,)
     np.testing.assert_allclose(both.outline[0, 1:].sum(0).mean(0), 4 * np.array([0, HEIGHT, 0]), atol=1e-6)
+
+
+def wall(low: float, high: float, half: float = 0.5) -> Mesh:
+    """A panel in the plane x = -0.1 that shines towards +x."""
+    corner = np.array([[-0.1, low, -half], [-0.1, high, -half], [-0.1, high, half], [-0.1, low, half]])
+    return make_mesh(corner, np.array([[0, 1, 2], [0, 2, 3]]), normal=np.tile([1.0, 0.0, 0.0], (4, 1)))
+
+
+TABLE = {"lobes": 4, "resolution": 12}
+
+
+def test_panels_through_the_horizon_are_those_above_it():
+    table, eye = lobe.tabulate(GGX(f0=0.9, roughness=0.4), **TABLE), jnp.array([1.0, 0.5, 0.1])
+    options = {"pieces": 16, "run": QUIET}
+    through, above = (
+        np.asarray(lamps.LitByLamps(lamps.precompute(GROUND, [panel], **options), table).view(eye))[0, :, 0]
+        for panel in (wall(-0.2, 0.5), wall(0.0, 0.5))
+    )
+    front = np.asarray(GROUND.position)[:, 0] > 0.1
+    assert np.linalg.norm((through - above)[front]) < 0.03 * np.linalg.norm(above[front])
+
+
+def test_points_behind_a_panel_see_no_highlight_and_have_slopes():
+    table, eye = lobe.tabulate(GGX(f0=0.9, roughness=0.4), **TABLE), jnp.array([1.0, 0.5, 0.1])
+    lit = lamps.LitByLamps(lamps.precompute(GROUND, [wall(0.05, 0.6)], run=QUIET), table)
+    face = np.asarray(GROUND.face)
+    points = on_triangles(face, np.arange(len(face)), np.tile(np.float32([0.6, 0.3, 0.1]), (len(face), 1)))
+    behind = np.asarray(points.carry(lit.transport.position))[:, 0] < -0.1
+    sent, at_vertices = np.asarray(lit.view(eye, None, points))[0, :, 0], np.asarray(lit.view(eye))[0, :, 0]
+    # Diffuse light is interpolated across the panel.
+    assert np.abs(sent[behind]).max() < 0.1 * at_vertices.max()
+    assert sent.max() < 1.5 * at_vertices.max()
+
+    def total(eye, table):
+        return jnp.sum(lamps.LitByLamps(lit.transport, table).view(eye) ** 2)
+
+    for slope in jax.tree.leaves(jax.jit(jax.grad(total, argnums=(0, 1), allow_int=True))(eye, table)):
+        assert np.isfinite(slope).all()
+
+
+@pytest.mark.parametrize("half", [3e-3, 3e-4, 3e-5])
+def test_small_panels_are_point_lights(half):
+    """Of the same flux: exact sums at the middle of the lamp, from .8 to 1.6 away."""
+    table, eye = lobe.tabulate(GGX(f0=0.9, roughness=0.3), **TABLE), jnp.array([0.4, 0.8, 0.6])
+    small = lamps.precompute(GROUND, [square([0, HEIGHT, 0], half, down=True)], run=QUIET)
+    bulb = lamps.precompute(GROUND, [PointLight("bulb", [0, HEIGHT, 0], 1.0)], run=QUIET)
+    got, expected = (np.asarray(lamps.LitByLamps(each, table).view(eye))[0, :, 0] for each in (small, bulb))
+    position = np.asarray(GROUND.position, np.float64) - [0, HEIGHT, 0]
+    expected = expected * 4 * half**2 * -position[:, 1] / np.linalg.norm(position, axis=1)
+    np.testing.assert_allclose(got, expected, rtol=0.02, atol=1e-3 * expected.max())
 
 
 def disk(corners: int) -> Mesh:
