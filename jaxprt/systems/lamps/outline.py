@@ -187,8 +187,8 @@ def above_horizon(corner: Float[Array, "k 3 v"]) -> Float[Array, "n 3 v"]:
     # Corners below the horizon lie where the outline goes below. Polygons that are below lie in one direction.
     none = jnp.array([[1], [0], [0]], corner.dtype)
     left = jnp.where(jnp.any(down, 0), jnp.sum(jnp.where(down, point, 0), 0), none)
-    kept = jnp.where(low >= 0, corner, left)
-    return jnp.stack([kept, jnp.where(crosses, point, kept)], 1).reshape(-1, *corner.shape[1:])
+    start = jnp.where(low >= 0, corner, left)
+    return jnp.stack([start, jnp.where(crosses, point, start)], 1).reshape(-1, *corner.shape[1:])
 
 
 @jit
