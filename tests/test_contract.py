@@ -72,8 +72,8 @@ REASONS = {
     "NumPy, or values or types that are looked at, on the host": """
         inverse scene.texture.unit_normals scene.sides image.pixels.sky image.pixels.pixel_angle systems.axes
         systems.ranges systems.lobe.system.matte_transport systems.lobe.pyramid.compress systems.lobe.pyramid.dither
-        systems.lamps.places systems.lamps.outline.of_lamps systems.bounces.traced.is_sharp
-        systems.bounces.traced.is_traced visibility.members.cluster
+        systems.lamps.places systems.lamps.outline.of_lamps systems.lamps.outline.triangles
+        systems.bounces.traced.is_sharp systems.bounces.traced.is_traced visibility.members.cluster
         visibility.members.coordinates systems.bright_texels.samples_for decompose.clustering
         decompose.eigen.orientation decompose.tucker.orient systems.separable.factorization.mark_of
         systems.dynamic.reflected.stacked systems.bounces.gather.shares systems.bounces.gather.cosines
@@ -662,7 +662,7 @@ EXAMPLES = {
             Points(jnp.array([[0, 1, 2], [1, 2, 0]]), jnp.full((2, 3), 0.5)),
         ),
         squares=((2, 3, 1), (2, 2, 1)),
-        gradient=(),
+        gradient=("lobe",),
     ),
     "systems.lobe.diffuse.coefficients": example(lambda draw: call(draw.normal(6, 8, 8, 3))),
     "systems.lobe.diffuse.irradiance": example(lambda draw: call(draw.normal(8, 3), draw.normal(8, 5))),

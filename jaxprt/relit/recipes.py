@@ -430,26 +430,26 @@ def _bright(system: System, visible: Any, shading: Shading, texels: int, size: i
     if not texels:
         return system
     samples, cells = samples_of(shading, size), cells and size > bright_texels.WIDEST
-    # Lobes narrower than cells read light and visibility within them.
-    by_lobes = cells and samples > 1
-    if by_lobes:
-        cells = isinstance(system, lobe.LobeSystem) and samples_of(shading, size, end=-1) <= _WIDE
-    options = {"samples": samples, "cells": cells, "by_lobes": by_lobes and cells}
+    by_lobes = cells and samples > 1  # Lobes narrower than cells read light and visibility within them.
+    if by_lobes and not (isinstance(system, lobe.LobeSystem) and samples_of(shading, size, roughest=True) <= _WIDE):
+        cells = by_lobes = False
+    options = {"samples": samples, "cells": cells, "by_lobes": by_lobes}
     return bright_texels.BrightTexels(system, visible, shading.brdf, count=texels, **options)
 
 
-def samples_of(shading: Shading, size: int, *, end: int = 0) -> int:
+def samples_of(shading: Shading, size: int, *, roughest: bool = False) -> int:
     """Number of points along the edge of a bright texel at which the BRDF of a part is evaluated.
 
     Args:
         shading: The part.
         size: Edge of the light's faces in texels.
-        end: 0 for its smallest roughness, -1 for its largest one.
+        roughest: Whether that is for the largest roughness of the part, not for the smallest one.
     """
     if shading.matte:
         return 1
     if shading.table is not None:
-        return shading.table.samples(shading.roughest if end else shading.smoothest, size)
+        return shading.table.samples(shading.roughest if roughest else shading.smoothest, size)
+    end = -1 if roughest else 0
     chosen: Callable = shading.brdf(jnp.asarray(shading.knot[0][end])) if shading.knot else shading.brdf
     return bright_texels.samples_for(chosen, size=size)
 

@@ -5,7 +5,10 @@ varies within the lobe. Cells are squares of texels whose mean radiance is taken
 
     L = rest + sum_j excess_j box_j        radiance = lobes(rest) + sum_j excess_j v_j f(wi_j, wo) ∫_cell j wi · n dwi
 
-where box_j is 1 in cell j and 0 elsewhere, v_j is the visible share of the cell, and wi_j its middle.
+where box_j is 1 in cell j and 0 elsewhere, v_j is the visible share of the cell, and wi_j its middle. A BRDF with lobes
+narrower than cells varies within these. Of such a BRDF, given as lobes, only the wide ones W read the rest:
+
+    radiance = wide(rest) + narrow(rest + sum_j excess_j box_j) + sum_j excess_j v_j ∫_cell j W(wi, wo) dwi
 """
 
 import dataclasses
@@ -144,7 +147,8 @@ class BrightTexels(VertexSystem):
         require.kind("the system", self.system, System, source="jaxprt.lobe.LobeSystem or another system")
         require.kind("the visibility", self.visibility, CellVisibility if self.cells else Visibility, source=source)
         if self.by_lobes and not (self.cells and self.system.lobe_part is self.system):
-            raise ValueError("by_lobes must be with cells and a system of lobes, as from jaxprt.lobe.LobeSystem")
+            system = type(self.system).__name__
+            raise ValueError(f"by_lobes must be with cells and a LobeSystem, got cells={self.cells} and a {system}")
         require.length("vertices of the visibility", self.visibility.position, self.system.vertices)
 
     def light(self, environment: Environment) -> BrightLight:

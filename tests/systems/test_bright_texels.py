@@ -352,7 +352,7 @@ def test_cells_need_faces_of_a_power_of_two_and_visibility_that_has_them(mesh, t
     nothing = harmonic.DiffuseSystem(harmonic.precompute_diffuse(mesh, size=SIZE), jnp.zeros(3))
     with pytest.raises(TypeError, match=r"which jaxprt\.lobe\.precompute makes"):
         bright_texels.BrightTexels(nothing, transport, GLOSSY, cells=True)
-    with pytest.raises(ValueError, match="by_lobes must be with cells and a system of lobes"):
+    with pytest.raises(ValueError, match="by_lobes must be with cells and a LobeSystem, got cells=False and a Diff"):
         bright_texels.BrightTexels(nothing, transport, GLOSSY, by_lobes=True)
 
 

@@ -56,11 +56,16 @@ def of_lamps(
     )
 
 
-def _of(lamp: Mesh) -> Float[np.ndarray, "k 3"] | None:
-    """Outline of a flat and convex lamp, counterclockwise for those on whom it shines; None for other lamps."""
+def triangles(lamp: Mesh) -> tuple[Float[np.ndarray, "f 3 3"], Float[np.ndarray, "f 3"]]:
+    """Corners of a lamp's triangles, and the area of each times the normal of the side that shines."""
     corner, normal = (np.asarray(row, np.float64)[np.asarray(lamp.face)] for row in (lamp.position, lamp.normal))
     across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
-    across *= np.where(np.sum(across * normal.sum(1), 1) < 0, -1, 1)[:, None]
+    return corner, across * np.where(np.sum(across * normal.sum(1), 1) < 0, -1, 1)[:, None]
+
+
+def _of(lamp: Mesh) -> Float[np.ndarray, "k 3"] | None:
+    """Outline of a flat and convex lamp, counterclockwise for those on whom it shines; None for other lamps."""
+    corner, across = triangles(lamp)
     area, whole = np.linalg.norm(across, axis=1), np.linalg.norm(across.sum(0))
     if not whole >= (1 - _FLAT) * area.sum() > 0:
         return None

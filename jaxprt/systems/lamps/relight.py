@@ -46,7 +46,9 @@ _RATHER = np.log(9.0)  # the share of rays rises while the lamp's radius goes fr
 _TINY = 1e-30
 _LEAST = 1e-14  # solid angle of a lamp, below which it is seen edge-on or from behind
 _FAR = 1e-6  # density of lobes far from a lamp
-_ALIKE = 0.01  # difference of the shares of pieces up to which they count as one, and half of that from which as theirs
+_ALIKE = (
+    0.01  # difference up to which shares of pieces are taken for one; from twice as much on, each piece has its own
+)
 
 
 class LitByLamps(eqx.Module):

@@ -8,7 +8,7 @@ evenly over the lamp's area A. Each point stands for a disk of area a = A / n:
 
 The term a / pi makes the result exact on the axis of a disk at any distance. A lamp emits on the side to which its
 normals point, and not on the other. Lamps are cut into pieces with separate integrals, so that highlights on smooth
-surfaces show the lamp's shape.
+surfaces show what hides a part of the lamp, and the shape of lamps that are no polygons.
 """
 
 import dataclasses
@@ -177,9 +177,7 @@ def sample_surface(lamp: Mesh, *, count: int) -> tuple[Float[np.ndarray, "s 3"],
         count: Number of points.
     """
     visibility.occluder.check(lamp, "lamp")
-    corner, normal = (np.asarray(row, np.float64)[np.asarray(lamp.face)] for row in (lamp.position, lamp.normal))
-    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
-    across *= np.where(np.sum(across * normal.sum(1), 1) < 0, -1, 1)[:, None]
+    corner, across = outline.triangles(lamp)
     area = np.linalg.norm(across, axis=1)
     if not area.sum() > 0:
         raise ValueError(f"a lamp must have an area above 0, got one whose {len(area)} triangles have none")

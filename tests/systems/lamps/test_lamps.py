@@ -58,17 +58,18 @@ def irradiance(point: np.ndarray, lamp: Mesh = LAMP) -> float:
     return float(abs(np.sum(across[:, 1] / np.linalg.norm(across, axis=1) * angle)) / 2)
 
 
-def lamp_integral(value) -> np.ndarray:
-    """Sum over a fine grid on the lamp: value(direction [n 3]) at each vertex, times solid angle."""
+def lamp_integral(value, most: float = SIDE) -> np.ndarray:
+    """Sum over a fine grid on the lamp up to an x: value(direction [n 3]) at each vertex, times solid angle."""
     grid = (np.arange(120) + 0.5) / 120 * 2 * SIDE - SIDE
     x, z = np.meshgrid(grid, grid)
-    place = np.stack([x, 0 * x + HEIGHT, z], -1).reshape(-1, 3)
+    place = np.stack([x, 0 * x + HEIGHT, z], -1)
+    area, place = (2 * SIDE / 120) ** 2, place[x < most]
     result = []
     for number, point in enumerate(np.asarray(GROUND.position, np.float64)):
         way = place - point
         square_ = np.sum(way**2, 1)
         unit = way / np.sqrt(square_)[:, None]
-        result.append(np.sum(value(number, unit) * unit[:, 1] / square_) * (2 * SIDE) ** 2 / len(place))
+        result.append(np.sum(value(number, unit) * unit[:, 1] / square_) * area)
     return np.array(result)
 
 
@@ -126,11 +127,16 @@ def test_what_stands_between_casts_a_shadow_and_backs_send_nothing():
     assert not np.any(lamps.precompute(GROUND, [below]).solid_angle)
 
 
-def test_half_a_lamp_behind_an_edge_sends_half_its_light():
-    """The edge of a wall in the plane x = 0 halves the lamp for vertices at x = 0, and hides nothing else's half."""
+@pytest.fixture(scope="module")
+def screen() -> Mesh:
+    """What hides the half of the lamp at x > 0, just below it."""
     high = HEIGHT - 1e-3
     corner = np.array([[0.0, high, -3], [3.0, high, -3], [3.0, high, 3], [0.0, high, 3]])
-    screen = make_mesh(corner, np.array([[0, 1, 2], [0, 2, 3]]), normal=np.tile([0.0, 1.0, 0.0], (4, 1)))
+    return make_mesh(corner, np.array([[0, 1, 2], [0, 2, 3]]), normal=np.tile([0.0, 1.0, 0.0], (4, 1)))
+
+
+def test_half_a_lamp_behind_an_edge_sends_half_its_light(screen):
+    """The edge of the screen halves the lamp for vertices at x = 0, and hides nothing else's half."""
     options = {"samples": 256, "pieces": 1}
     whole, half = (
         np.asarray(lamps.precompute(GROUND, [LAMP], occluder=join([GROUND, LAMP, *more]), **options).cosine)
@@ -239,7 +245,7 @@ def test_panels_through_the_horizon_are_those_above_it():
         for panel in (wall(-0.2, 0.5), wall(0.0, 0.5))
     )
     front = np.asarray(GROUND.position)[:, 0] > 0.1
-    assert np.linalg.norm((through - above)[front]) < 0.03 * np.linalg.norm(above[front])
+    assert np.linalg.norm((through - above)[front]) < 0.01 * np.linalg.norm(above[front])
 
 
 def test_points_behind_a_panel_see_no_highlight_and_have_slopes():
@@ -250,8 +256,8 @@ def test_points_behind_a_panel_see_no_highlight_and_have_slopes():
     behind = np.asarray(points.carry(lit.transport.position))[:, 0] < -0.1
     sent, at_vertices = np.asarray(lit.view(eye, None, points))[0, :, 0], np.asarray(lit.view(eye))[0, :, 0]
     # Diffuse light is interpolated across the panel.
-    assert np.abs(sent[behind]).max() < 0.1 * at_vertices.max()
-    assert sent.max() < 1.5 * at_vertices.max()
+    assert np.abs(sent[behind]).max() < 0.05 * at_vertices.max()
+    assert sent.max() < 1.1 * at_vertices.max()
 
     def total(eye, table):
         return jnp.sum(lamps.LitByLamps(lit.transport, table).view(eye) ** 2)
@@ -262,14 +268,14 @@ def test_points_behind_a_panel_see_no_highlight_and_have_slopes():
 
 @pytest.mark.parametrize("half", [3e-3, 3e-4, 3e-5])
 def test_small_panels_are_point_lights(half):
-    """Of the same flux: exact sums at the middle of the lamp, from .8 to 1.6 away."""
+    """A panel that is much smaller than its distance lights the ground as a point light of the same flux does."""
     table, eye = lobe.tabulate(GGX(f0=0.9, roughness=0.3), **TABLE), jnp.array([0.4, 0.8, 0.6])
     small = lamps.precompute(GROUND, [square([0, HEIGHT, 0], half, down=True)], run=QUIET)
     bulb = lamps.precompute(GROUND, [PointLight("bulb", [0, HEIGHT, 0], 1.0)], run=QUIET)
     got, expected = (np.asarray(lamps.LitByLamps(each, table).view(eye))[0, :, 0] for each in (small, bulb))
     position = np.asarray(GROUND.position, np.float64) - [0, HEIGHT, 0]
     expected = expected * 4 * half**2 * -position[:, 1] / np.linalg.norm(position, axis=1)
-    np.testing.assert_allclose(got, expected, rtol=0.02, atol=1e-3 * expected.max())
+    np.testing.assert_allclose(got, expected, rtol=1e-3, atol=1e-4 * expected.max())
 
 
 def disk(corners: int) -> Mesh:
@@ -282,10 +288,11 @@ def disk(corners: int) -> Mesh:
 reflected = jax.jit(lambda table, wi, wo: table(wi, wo))
 
 
-def test_highlights_of_lamps_are_integrals_over_the_lamp(close):
+@pytest.mark.parametrize("hidden", [False, True])
+def test_highlights_of_lamps_are_integrals_over_what_is_seen_of_the_lamp(close, screen, hidden):
     """Of what the table of lobes says of the BRDF, so that its own error has no part."""
     eye = jnp.array([0.4, 0.8, 0.6])  # sees the lamp mirrored around a vertex
-    options = {"pieces": 16, "occluder": join([GROUND, LAMP])}
+    options = {"pieces": 16, "occluder": join([GROUND, LAMP, *([screen] if hidden else [])])}
     fine = lamps.precompute(GROUND, [LAMP, BULB], **options)
     for roughness in (0.3, 0.5):
         table = lobe.tabulate(GGX(f0=0.9, roughness=roughness), lobes=4, resolution=12)
@@ -304,7 +311,7 @@ def test_highlights_of_lamps_are_integrals_over_the_lamp(close):
         left = np.asarray(lit.view(eye, traced=jnp.ones(COUNT)))
         assert np.all(left <= np.asarray(sent) * (1 + 1e-5))
         assert np.all(left >= 0)
-        expected = lamp_integral(value)
+        expected = lamp_integral(value, 0.0 if hidden else SIDE)
         got = np.asarray(lit.combine(jnp.array([[1.0], [0.0]]), sent))[:, 0]
         assert np.linalg.norm(got - expected) <= FLAT_SHAPED * np.linalg.norm(expected)
         way = np.asarray(BULB.position) - np.asarray(GROUND.position)
