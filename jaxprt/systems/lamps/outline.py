@@ -24,11 +24,11 @@ from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.scene import PointLight
 
 _CORNERS = 8  # most corners of an outline
-_FLAT = 1e-3  # largest distance of corners from their plane, and area outside of triangles, relative to the extent
+_FLAT = 1e-3  # largest height above the plane, and area beside or on other triangles, relative to a lamp's own
 _STRAIGHT = 1e-6  # area that a corner adds, relative to that of the polygon, below which it is none
 _REACH = 3.5  # distance along an edge from which on all of a lobe is nearer, in standard deviations
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
-_SMALL = 0.02
+_SMALL = 0.02  # exponents whose exponential is a series
 _SHORT = 3e-7  # length of edges, in radians, that may be rounding
 _TINY = 1e-12
 
@@ -51,9 +51,8 @@ def of_lamps(
     if not polygons:
         return None, ()
     corners = max(len(polygon) for row in polygons.values() for polygon in row)
-    return put(np.stack([_stacked(row, corners) for row in polygons.values()]).astype(jnp.result_type(float))), tuple(
-        polygons
-    )
+    rows = np.stack([_stacked(row, corners) for row in polygons.values()])
+    return put(rows.astype(jnp.result_type(float))), tuple(polygons)
 
 
 def triangles(lamp: Mesh) -> tuple[Float[np.ndarray, "f 3 3"], Float[np.ndarray, "f 3"]]:

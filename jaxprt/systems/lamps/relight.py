@@ -46,9 +46,7 @@ _RATHER = np.log(9.0)  # the share of rays rises while the lamp's radius goes fr
 _TINY = 1e-30
 _LEAST = 1e-14  # solid angle of a lamp, below which it is seen edge-on or from behind
 _FAR = 1e-6  # density of lobes far from a lamp
-_ALIKE = (
-    0.01  # difference up to which shares of pieces are taken for one; from twice as much on, each piece has its own
-)
+_ALIKE = 0.01  # Visible shares of pieces that differ by less count as one, from twice as much on as they are.
 
 
 class LitByLamps(eqx.Module):
@@ -225,9 +223,10 @@ def _reflect_flat(
     way = outline[..., None] - position.T
     local = jnp.stack([sum(way[:, :, j] * frame[:, i, j] for j in range(3)) for i in range(3)], 2)  # [q k 3 v]
     local = local / jnp.sqrt(jnp.maximum(jnp.sum(local**2, 2, keepdims=True), _TINY))
-    low = jnp.any(local[:, :, 2] < 0)
-    filled = jax.lax.cond(
-        low, lambda: _filled(lobe, jax.vmap(above_horizon)(local), solid), lambda: _filled(lobe, local, solid)
+    filled = jax.lax.cond(  # Clipping doubles the number of edges.
+        jnp.any(local[:, :, 2] < 0),
+        lambda: _filled(lobe, jax.vmap(above_horizon)(local), solid),
+        lambda: _filled(lobe, local, solid),
     )
     return _sent(lobe, traced, whole, filled, jnp.sum(matte, 0))
 
@@ -235,9 +234,9 @@ def _reflect_flat(
 def _filled(lobe: LobeMixture, corner: Float[Array, "q k 3 v"], solid: Float[Array, "p v"]) -> Float[Array, "l v"]:
     """Share of each lobe that the visible part of a flat lamp fills, by the corners of the lamp and of its pieces."""
     full = jnp.maximum(jax.vmap(solid_angle)(corner[1:]), 0)
-    total_angle = jnp.sum(full, 0)
-    faces = total_angle > _LEAST
-    size = jnp.where(faces, total_angle, 1)
+    size = jnp.sum(full, 0)
+    faces = size > _LEAST
+    size = jnp.where(faces, size, 1)
     # What vertices see, interpolated, may be more than there is.
     share = jnp.clip(jnp.where(full > 0, solid / jnp.where(full > 0, full, 1), 0), 0, 1)
     visible = jnp.clip(jnp.sum(solid, 0) / size, 0, 1)
@@ -258,8 +257,8 @@ def _filled(lobe: LobeMixture, corner: Float[Array, "q k 3 v"], solid: Float[Arr
     toward, chord = disk(corner[0])
     small = _as_lobes(lobe.mean, lobe.concentration, toward, chord)[0] * size
     exact = lobe_integral(lobe.mean, lobe.concentration, corner[0])
-    share_of_exact = _smooth(lobe.concentration * chord)
-    return jnp.where(faces, (small + share_of_exact * (exact - small)) * shown, 0)
+    filled = small + _smooth(lobe.concentration * chord) * (exact - small)
+    return jnp.where(faces, filled * shown, 0)
 
 
 def _smooth(size: Array) -> Array:
@@ -285,15 +284,19 @@ def mean_density(mean: Array, concentration: Array, toward: Sequence[Array], cho
     share = _smooth(size)
     inside = _inside(jnp.maximum(size, _SMALL), concentration * apart)
     large = inside / (np.pi * jnp.maximum(chord, _SMALL / concentration))
-    # Normalizes the normal distribution, which is cut off at a chord of 2.
-    return (small + share * (large - small)) / -jnp.expm1(-2 * concentration)
+    return small + share * (large / _within(concentration) - small)
 
 
 def _as_lobes(mean: Array, concentration: Array, toward: Sequence[Array], chord: Array) -> tuple[Array, Array]:
     """Mean density of lobes over disks that are treated as lobes too, and squared distances from their centers."""
     apart = reduce(jnp.add, ((mean[i] - toward[i]) ** 2 for i in range(3)))
     variance = 1 / concentration + chord / 4
-    return jnp.exp(-apart / (2 * variance)) / (2 * np.pi * variance), apart
+    return jnp.exp(-apart / (2 * variance)) / (2 * np.pi * variance * _within(concentration)), apart
+
+
+def _within(concentration: Array) -> Array:
+    """Share of a normal distribution in the chord up to its largest value, 2, by which densities are divided."""
+    return -jnp.expm1(-2 * concentration)
 
 
 def _inside(size: Array, offset: Array) -> Array:

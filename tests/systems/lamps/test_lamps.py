@@ -1,5 +1,7 @@
 """Lamps: integrals of what is seen against closed forms, lobes over disks against SciPy, and what surfaces send."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -266,10 +268,12 @@ def test_points_behind_a_panel_see_no_highlight_and_have_slopes():
         assert np.isfinite(slope).all()
 
 
-@pytest.mark.parametrize("half", [3e-3, 3e-4, 3e-5])
-def test_small_panels_are_point_lights(half):
+@pytest.mark.parametrize(("half", "wide"), [(3e-3, False), (3e-4, False), (3e-5, False), (3e-3, True)])
+def test_small_panels_are_point_lights(half, wide):
     """A panel that is much smaller than its distance lights the ground as a point light of the same flux does."""
     table, eye = lobe.tabulate(GGX(f0=0.9, roughness=0.3), **TABLE), jnp.array([0.4, 0.8, 0.6])
+    if wide:  # of concentration 1
+        table = dataclasses.replace(table, scale=0 * table.scale)
     small = lamps.precompute(GROUND, [square([0, HEIGHT, 0], half, down=True)], run=QUIET)
     bulb = lamps.precompute(GROUND, [PointLight("bulb", [0, HEIGHT, 0], 1.0)], run=QUIET)
     got, expected = (np.asarray(lamps.LitByLamps(each, table).view(eye))[0, :, 0] for each in (small, bulb))
