@@ -627,6 +627,7 @@ EXAMPLES = {
     ),
     "systems.bounces.tensor.scales": example(lambda draw: call((draw.normal(4, 2), draw.normal(2, 3)))),
     "systems.lobe.table.traced_share": example(lambda draw: call(10 + 10 * draw.uniform(5))),
+    "systems.lobe.table.traced_visibility": example(lambda draw: call(1000 + 1000 * draw.uniform(5))),
     "sphere.cubemap.coarse": example(lambda draw: call(draw.normal(6, 4, 4, 2)), edge=2),
     "systems.lamps.relight.ray_share": example(
         lambda draw: call(draw.uniform(5, low=2, high=90), draw.uniform(5, low=0.05, high=0.5))

@@ -52,7 +52,9 @@ class Caster:
     def cast(
         self, rays: ReflectionRays, points: Points, *, at_vertices: bool
     ) -> tuple[Int[np.ndarray, "j v"], Float[np.ndarray, "j v 3"], Float[np.ndarray, "v 3"]]:
-        """The triangle that each ray hits (-1 for none), barycentric weights of the hit, and origins of the rays.
+        """The triangle that each ray hits, barycentric weights of the hit, and origins of the rays.
+
+        The triangle is -1 for a ray that hits none, and -2 for a ray that hits a back.
 
         Args:
             rays: ReflectionRays that start from vertices or points.
@@ -65,10 +67,11 @@ class Caster:
         ray, point = np.nonzero(chance > 0)
         triangle, barycentric = np.full(chance.shape, -1), np.zeros((*chance.shape, 3), np.float32)
         hit, weight = first_fronts(self.occluder, self.normal, start[point], np.ascontiguousarray(way[ray, point]))
-        # Ignore hits of the ray's own triangle, or of a triangle around its own vertex: the origin may lie below it.
+        # Hits of the ray's own triangle, or of a triangle around its own vertex, reflect nothing: the origin may lie
+        # below it. A point's own triangle hides what is below it, as where normals of vertices face away from it.
         same = self.face[hit] == corner[point]
         itself = np.any(same, 1) if at_vertices else np.all(same, 1)
-        triangle[ray, point], barycentric[ray, point] = np.where(itself, -1, hit), weight
+        triangle[ray, point], barycentric[ray, point] = np.where(itself, -1 if at_vertices else -2, hit), weight
         return triangle, barycentric, start
 
     def spread(

@@ -50,12 +50,14 @@ class Row(eqx.Module):
         index: Indices of the points among all points of the picture; -1 is padding. Inside of `jax.jit` these are all
             rows of the group.
         viewed: What does not depend on the light; None if it is computed anew for each light.
+        missed: Share of the reflection rays of narrow lobes that hit nothing; None without rays.
     """
 
     group: int = eqx.field(static=True)
     samples: int = eqx.field(static=True)
     index: Int[Array | np.ndarray, "*m p"]
     viewed: Viewed | None
+    missed: Float[Array, " p"] | None = None
 
 
 class PictureView(eqx.Module):
@@ -387,7 +389,7 @@ def _shaded(
     """Colors of some points of a row under each light, with a view that is not stored."""
     points, on_group = canvas.points_of(picture.stage, picture.pixels, index)
     transport = None if lamps is None else lamps.row(row.group, index, on_group)
-    seen = _seen(picture.stage, row.group, points, on_group, picture.camera, lamps=transport)
+    seen = _seen(picture.stage, row, points, on_group, picture.camera, lamps=transport)
     return [_lit(surface, row, index, seen, light, apart=apart) for light in lights]
 
 
@@ -465,23 +467,29 @@ def make(
         pixels, rows = _placed(stage, camera, samples, between)
     rays = isinstance(shadow, Environment) or shadow == "rays"
     lit = lamplight.of(stage, pixels, camera.width) if rays else None
-    complete, origins, sharp = [], [], stage.sharp_groups
+    complete, places, origins, sharp = [], [], [], stage.sharp_groups
     for row in rows:
-        stores = keep and not isinstance(row.index, Tracer)
-        if stores or row.group in sharp:
-            index = row.index if row.index.ndim == 1 else row.index[0]
-            points, on_group = canvas.points_of(stage, pixels, index)
-            transport = None if lit is None else lit.row(row.group, index, on_group)
-            if stores:
-                seen = _seen(stage, row.group, points, on_group, camera, lamps=transport)
-                row = dataclasses.replace(row, viewed=seen)
-            if row.group in sharp:
-                blend, tilted = stage.blend(row.group, points, on_group)
-                narrow = stage.sharp_at(row.group, points)
-                turn = _turn(pixels, index)
-                origins.append(tracing.RayOrigins(row.group, points, tilted, blend, narrow, transport, turn))
-        complete.append(row)
+        index = row.index if row.index.ndim == 1 else row.index[0]
+        stores = keep and not isinstance(index, Tracer)
+        if not stores and row.group not in sharp:
+            places.append(None)
+            continue
+        points, on_group = canvas.points_of(stage, pixels, index)
+        transport = None if lit is None else lit.row(row.group, index, on_group)
+        places.append((points, on_group, transport) if stores else None)
+        if row.group in sharp:
+            blend, tilted = stage.blend(row.group, points, on_group)
+            narrow, turn = stage.sharp_at(row.group, points), _turn(pixels, index)
+            origins.append(tracing.RayOrigins(row.group, points, tilted, blend, narrow, transport, turn))
     reflected = tracing.trace(stage, origins, jnp.asarray(camera.eye), keep=keep) if origins else None
+    paths = iter(() if reflected is None else reflected.paths)
+    for row, place in zip(rows, places, strict=True):
+        if row.group in sharp:
+            row = dataclasses.replace(row, missed=next(paths).missed)
+        if place is not None:
+            points, on_group, transport = place
+            row = dataclasses.replace(row, viewed=_seen(stage, row, points, on_group, camera, lamps=transport))
+        complete.append(row)
     ray = raster.ray_direction(camera)
     shares, way = None, "vertices"
     if isinstance(shadow, Environment):
@@ -518,11 +526,12 @@ def drawn(camera: Camera, samples: int) -> tuple[int, Camera, int]:
 
 
 def _seen(
-    stage: Stage, group: int, points: Points, on_group: Points, camera: Camera, lamps: LampTransport | None = None
+    stage: Stage, row: Row, points: Points, on_group: Points, camera: Camera, lamps: LampTransport | None = None
 ) -> Viewed:
     """What does not depend on the light, for a row of points with their materials."""
-    surface = sampled(surface_of(stage, group), 1)  # The view does not depend on the samples of bright texels.
-    options = {"fixed": stage.fixed[group], "sharp": stage.sharp_at(group, points), "lamps": lamps}
+    surface = sampled(surface_of(stage, row.group), 1)  # The view does not depend on the samples of bright texels.
+    options = {"fixed": stage.fixed[row.group], "sharp": stage.sharp_at(row.group, points)}
+    options |= {"lamps": lamps, "missed": row.missed}
     return view(surface, on_group, stage.table.at(points), jnp.asarray(camera.eye), **options)
 
 

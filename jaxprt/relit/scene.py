@@ -268,9 +268,9 @@ class RelitScene(System):
         """
         groups.check_points(points, self.scene.counts)
         eye = require.position("the eye", origins.local("the eye", eye, self.mesh.origin))
-        stage, views, starts = self._stage(materials), [], []
+        stage, seen, starts = self._stage(materials), [], []
         for group, look in enumerate(stage.appearance):
-            surface, (in_scene, on_group) = groups.surface_of(stage, group), self.layout.points(group, points)
+            in_scene, on_group = self.layout.points(group, points)
             if stage.table.frame is not None:
                 on_group = on_group.tilted(stage.table.at(in_scene).normal)
             blend, emitted = jax.tree.map(on_group.carry, (look.blend, look.emitted))
@@ -281,8 +281,13 @@ class RelitScene(System):
                         real = np.arange(len(sharp)) < sum(self.layout.of_group(group, self.layout.counts))
                         sharp = sharp * tracing.facing(self.mesh, eye)[in_scene.corner[0]] * real.astype(sharp.dtype)
                 starts.append(tracing.RayOrigins(group, in_scene, on_group, blend, sharp))
-            views.append(Viewed(on_group, view_of(surface, eye, blend, on_group, sharp), emitted))
+            seen.append((on_group, blend, sharp, emitted))
         reflected = tracing.trace(stage, starts, eye, keep=True) if starts else None
+        paths, views = iter(() if reflected is None else reflected.paths), []
+        for group, (on_group, blend, sharp, emitted) in enumerate(seen):
+            missed = None if sharp is None else next(paths).missed
+            of_group = view_of(groups.surface_of(stage, group), eye, blend, on_group, sharp, missed=missed)
+            views.append(Viewed(on_group, of_group, emitted))
         return SceneView(tuple(views), stage, reflected)
 
     @promoted

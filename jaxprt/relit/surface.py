@@ -90,6 +90,7 @@ def view(
     variance: Float[Array, " p"] | None = None,
     glows: bool = True,
     lamps: LampTransport | None = None,
+    missed: Float[Array, " p"] | None = None,
 ) -> Viewed:
     """All of the points' radiance that does not depend on the light.
 
@@ -104,10 +105,11 @@ def view(
             `jaxprt.systems.lobe.widened`.
         glows: Whether emission is seen. Reflection rays do not see it, because they add lamps separately.
         lamps: The transport of the lamps to the points; None to interpolate it between vertices.
+        missed: Share of the reflection rays of narrow lobes that hit nothing; see `jaxprt.lobe.view_lobes`.
     """
     points = points.tilted(look.normal)
     blend, emitted = material(surface, points, look, fixed)
-    seen = view_of(surface, eye, blend, points, sharp, variance=variance, lamps=lamps)
+    seen = view_of(surface, eye, blend, points, sharp, variance=variance, lamps=lamps, missed=missed)
     sight = _sight(surface, points, eye, blend)
     return Viewed(points, seen, emitted if glows else jnp.zeros_like(emitted), sight)
 
@@ -173,6 +175,7 @@ def view_of(
     *,
     variance: Array | None = None,
     lamps: LampTransport | None = None,
+    missed: Float[Array, " p"] | None = None,
 ) -> tuple[PyTree, PyTree, PyTree]:
     """The view of all systems of a group at points on it.
 
@@ -184,6 +187,7 @@ def view_of(
         sharp: 1 where narrow lobes are traced by rays, 0 elsewhere; None for a group without rays.
         variance: Variance in squared radians by which lobes are widened; see `jaxprt.systems.lobe.widened`.
         lamps: The transport of the lamps to the points; None to interpolate it between vertices.
+        missed: Share of the reflection rays of narrow lobes that hit nothing; see `jaxprt.lobe.view_lobes`.
     """
     system, reflecting, lit = surface.system, surface.reflecting, surface.lit
     reflected = None if reflecting is None else reflecting.view(eye, blend, points, sharp)
@@ -194,7 +198,8 @@ def view_of(
         lit = lit.view(eye, blend, points, sharp)
     if variance is not None and widened.can_widen(system):
         return widened.view(system, eye, blend, points, variance), reflected, lit
-    return system.view(eye, blend, points), reflected, lit
+    options = {} if missed is None or system.lobe_part is None else {"missed": missed}
+    return system.view(eye, blend, points, **options), reflected, lit
 
 
 @kept

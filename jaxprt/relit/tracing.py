@@ -3,7 +3,8 @@
 Rays start from vertices or points and follow the narrow lobes of `jaxprt.systems.bounces.traced`. Each ray reads the
 radiance of the front face that it hits: direct light, and light that was reflected before, represented by 16 harmonics.
 Rays that hit nothing or a back face contribute nothing, because light of the environment is already part of direct
-light. Rays that hit a lamp determine how much of it is visible in the reflection.
+light: their share is the visibility of very narrow lobes there. Rays that hit a lamp determine how much of it is
+visible in the reflection.
 
 Embree casts the rays on the host, once for each eye position and roughness. The hit points are constants. Radiance is
 therefore differentiable in the light and in the colors of all materials. Derivatives with respect to the eye or to
@@ -33,6 +34,7 @@ from jaxprt.systems.bounces import ReflectingPart
 from jaxprt.systems.bounces.traced import ReflectionRays
 from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.lamps.relight import ray_share
+from jaxprt.systems.lobe.table import traced_visibility
 from jaxprt.systems.protocol import Blend
 
 _MOST_RAYS = 1 << 12  # of each vertex or point
@@ -72,11 +74,13 @@ class PathWeights(eqx.Module):
         slot: Index of each ray's hit among all hits; the number of hits if there is none.
         weight: Factor of the radiance that each ray reads.
         lamp: Factor of the radiance of each lamp; None without lamps.
+        missed: Share of the rays of narrow lobes that hit nothing; -1 where there are none.
     """
 
     slot: Int[Array | np.ndarray, "j v"]
     weight: Float[Array, "j v c"]
     lamp: Float[Array, "n v c"] | None
+    missed: Float[Array, " v"]
 
 
 class HitRow(eqx.Module):
@@ -150,15 +154,17 @@ def trace(stage: Stage, origins: Sequence[RayOrigins], eye: Float[Array, "3"], *
         with jax.ensure_compile_time_eval():
             bundle = _reflecting(stage, origin).rays(eye, origin.parameter, origin.on_group, origin.share)
             bundle = bundle if origin.turn is None else _shared(bundle, origin.turn)
+            narrow = traced_visibility(bundle.concentration) * (bundle.chance > 0)
             hit = cast.cast(bundle, origin.points, at_vertices=origin.on_group.all_vertices)
             hits.append((*hit, cast.spread(bundle, *hit)))
-            rays.append(bundle)
+            rays.append((bundle, _missed(np.asarray(narrow), hit[0])))
     slots, rows = _rows(stage, cast, hits, keep=keep)
     paths = []
-    for origin, bundle, slot, (triangle, *_) in zip(origins, rays, slots, hits, strict=True):
+    for origin, (bundle, missed), slot, (triangle, *_) in zip(origins, rays, slots, hits, strict=True):
         weight = _reflecting(stage, origin).weights(bundle, eye, origin.blend, origin.on_group, origin.share)
         part = np.where(triangle >= 0, stage.part[cast.face[triangle, 0]], -1)
-        paths.append(PathWeights(slot, weight, _lamps(stage, origin, part, weight, bundle.concentration)))
+        lamp = _lamps(stage, origin, part, weight, bundle.concentration)
+        paths.append(PathWeights(slot, weight, lamp, missed))
     return Reflections(tuple(paths), rows)
 
 
@@ -167,6 +173,12 @@ def _shared(rays: ReflectionRays, turn: Int[np.ndarray, " v"]) -> ReflectionRays
     several = min(4, len(rays.chance))
     other = (turn >= 0) & (np.arange(len(rays.chance))[:, None] % several != turn % several)
     return dataclasses.replace(rays, chance=put(np.where(other, 0, np.asarray(rays.chance))))
+
+
+def _missed(narrow: Float[np.ndarray, "j v"], triangle: Int[np.ndarray, "j v"]) -> Float[Array, " v"]:
+    """Share of the rays of narrow lobes that hit nothing, at each vertex or point; -1 where there are none."""
+    total, free = narrow.sum(0), (narrow * (triangle == -1)).sum(0)
+    return put(np.where(total > 0, free / np.where(total > 0, total, 1), -1).astype(narrow.dtype))
 
 
 def _reflecting(stage: Stage, origin: RayOrigins) -> ReflectingPart:

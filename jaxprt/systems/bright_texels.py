@@ -199,9 +199,14 @@ class BrightTexels(VertexSystem):
         """The light, whose rest is that of the underlying system: `System.tilted`."""
         return dataclasses.replace(light, rest=self.system.tilted(light.rest, normal))
 
-    def view(self, eye: Float[Array, "*p 3"], materials: PyTree = None, points: Points = VERTICES) -> BrightView:
-        """The view of the underlying system, and the frames and directions for which the bright texels are summed."""
-        options: dict[str, Any] = {"two_lights": True} if self.by_lobes else {}
+    def view(
+        self, eye: Float[Array, "*p 3"], materials: PyTree = None, points: Points = VERTICES, **options: Any
+    ) -> BrightView:
+        """The view of the underlying system, and the frames and directions for which the bright texels are summed.
+
+        `options` are those of the underlying system.
+        """
+        options |= {"two_lights": True} if self.by_lobes else {}
         rest = self.system.view(eye, materials, points, **options)
         position, frame = placed(self.visibility.position, self.visibility.frame, points)
         eye = require.position("the eye", eye, points=len(position))

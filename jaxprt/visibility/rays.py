@@ -407,7 +407,7 @@ def first_fronts(
     start: Float32[np.ndarray, "b 3"],
     direction: Float32[np.ndarray, "b 3"],
 ) -> tuple[Int[np.ndarray, " b"], Float[np.ndarray, "b 3"]]:
-    """The first triangle on each ray and its barycentric coordinates; -1 if the ray hits nothing or a back.
+    """The first triangle on each ray and its barycentric coordinates; -1 if the ray hits nothing, -2 if it hits a back.
 
     Args:
         occluder: The scene.
@@ -417,6 +417,6 @@ def first_fronts(
     """
     triangle, _, barycentric = occluder.facing_hit(start, direction)
     hit = np.flatnonzero(triangle >= 0)
-    triangle[hit[~hits_front(occluder, normal, occluder.face[triangle[hit]], direction[hit])]] = -1
+    triangle[hit[~hits_front(occluder, normal, occluder.face[triangle[hit]], direction[hit])]] = -2
     weight = np.clip(barycentric, 0, 1)
     return triangle, weight / np.maximum(weight.sum(1, keepdims=True), 1e-6)

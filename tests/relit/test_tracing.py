@@ -186,6 +186,23 @@ def test_four_points_of_a_sample_share_its_rays(monkeypatch):
     np.testing.assert_allclose(pictures[1][inside > 0.3] / (ALBEDO * GLOW), 1, rtol=COARSE)
 
 
+def test_the_sky_in_a_mirror_ends_where_the_closed_form_has_the_wall(close):
+    """Stored visibility, of vertices and of texels as wide as a third of the wall, has no such edge."""
+    black, white = {"wall": wall(0.0, emissive=np.zeros(3))}, Environment(jnp.ones((6, SIZE, SIZE, 3)))
+    view = relit().picture_view(CAMERA, materials=black, samples=1)
+    sky, inside = np.asarray(view.picture(white)).reshape(-1, 3), mirrored_by_pixels()
+    assert min((inside > 0.02).sum(), (inside < -0.02).sum()) > 50
+    np.testing.assert_allclose(sky[inside > 0.02], 0, atol=COARSE)
+    np.testing.assert_allclose(sky[inside < -0.02], ALBEDO, rtol=COARSE)
+    close(relit().picture(white, CAMERA, materials=black, samples=1).reshape(-1, 3), sky, tolerance=1e-5)
+    vertices, inside = (
+        relit().radiance(white, materials=black, eye=EYE)[:49],
+        mirrored(np.array(mesh("floor").position)),
+    )
+    np.testing.assert_allclose(vertices[inside > 0.1], 0, atol=COARSE)
+    np.testing.assert_allclose(vertices[inside < -0.1], ALBEDO, rtol=COARSE)
+
+
 def test_light_is_linear_and_colors_have_the_gradient_of_finite_differences(close):
     ready, weight = relit(), np.random.default_rng(2).normal(size=(98, 3)).astype(np.float32)
     view = ready.view(EYE)

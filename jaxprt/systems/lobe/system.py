@@ -29,7 +29,7 @@ from jaxprt.systems.lobe import squares as over_squares
 from jaxprt.systems.lobe.blurred_light import LobeLight, prefilter, scales
 from jaxprt.systems.lobe.exported import DEGREE, CoarseTransport, ExportedLobes
 from jaxprt.systems.lobe.pyramid import LobeTransport, between, corners
-from jaxprt.systems.lobe.table import LobeBrdf, LobeMixture
+from jaxprt.systems.lobe.table import LobeBrdf, LobeMixture, traced_visibility
 from jaxprt.systems.protocol import Blend
 
 _LEAST = 1e-3  # smallest visibility by which the shift of a lobe is divided
@@ -121,13 +121,15 @@ class LobeSystem(protocol.VertexSystem):
         *,
         variance: Float[Array, " p"] | None = None,
         two_lights: bool = False,
+        missed: Float[Array, " p"] | None = None,
     ) -> LobeView:
         """Texels at which each point reads the blurred light, with visibility.
 
         `variance`, in squared radians, widens the lobes of each point. With `two_lights` the view is of such a light.
+        `missed`, the share of the rays of narrow lobes that hit nothing, is the visibility of these; -1 without rays.
         """
         protocol.check_blend(materials)
-        options = {"eye": eye, "points": points, "variance": variance, "two_lights": two_lights}
+        options = {"eye": eye, "points": points, "variance": variance, "two_lights": two_lights, "missed": missed}
         # The irradiance comes with the light: each row of points would hold a copy of the vectors.
         transport = eqx.tree_at(lambda stored: stored.vector, self.transport, self.transport.vector[:0])
         if materials is None:
@@ -234,6 +236,7 @@ def view_lobes(
     points: Points = VERTICES,
     variance: Float[Array, " p"] | None = None,
     two_lights: bool = False,
+    missed: Float[Array, " p"] | None = None,
 ) -> LobeView:
     """Finds the texels of the blurred light that each vertex or point reads for a view, and their visibility.
 
@@ -246,11 +249,13 @@ def view_lobes(
         variance: Variance in squared radians, along one axis, by which the lobes of each point are widened; None for
             zero.
         two_lights: Whether wide lobes read a light of their own; see `LobeSystem.two_lights`.
+        missed: Share of the rays of narrow lobes that hit nothing, which is their visibility; -1 at points without
+            rays. None without rays.
     """
     count = len(transport.position)
     protocol.check_points(points, count)
     eye = require.position("the eye", eye, points=points.count(count))
-    return _view_lobes(transport, brdf, parameter, eye, points, variance, two_lights=two_lights)
+    return _view_lobes(transport, brdf, parameter, eye, points, variance, missed, two_lights=two_lights)
 
 
 @partial(jit, static_argnames=("two_lights",))
@@ -261,12 +266,15 @@ def _view_lobes(
     eye: Array,
     points: Points,
     variance: Array | None,
+    missed: Array | None,
     *,
     two_lights: bool,
 ) -> LobeView:
     placing = *placed(transport.position, transport.frame, points), brdf, eye, variance
     lobe, (face, s, t, spread) = _places(*placing, *parameter)
     seen = transport.lobe_visibility(face, s, t, spread, points)
+    if missed is not None:
+        seen = _partly_traced(seen, missed, lobe.concentration)
     place, visible = _taps(face, s, t, spread, lobe.concentration, seen, size=transport.size)
     view = LobeView(place, visible, lobe.weight, lobe.diffuse, transport.vector, points, transport.size)
     if not two_lights:
@@ -274,6 +282,15 @@ def _view_lobes(
     after = jnp.where(_is_wide(lobe.concentration), scales(transport.size).total, 0)
     place = tuple(texel + after for texel in place)
     return dataclasses.replace(view, place=place, mean=lobe.mean, concentration=lobe.concentration)
+
+
+def _partly_traced(
+    seen: tuple[Array, Array, Array], missed: Float[Array, " v"], concentration: Float[Array, "l v"]
+) -> tuple[Array, Array, Array]:
+    """Visibility of lobes and its derivatives, those of narrow ones by rays, which do not move what a lobe reads."""
+    share = jnp.where(missed < 0, 0, traced_visibility(concentration))
+    stored, by_s, by_t = (rows * (1 - share) for rows in seen)
+    return stored + missed * share, by_s, by_t
 
 
 def _is_wide(concentration: Float[Array, "*b"]) -> Bool[Array, "*b"]:

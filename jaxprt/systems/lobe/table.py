@@ -33,6 +33,7 @@ _DEGREE = 24  # of the natural light under which the error of a table is measure
 _COUNTS = (2, 4, 6, 8, 12, 16, 24, 32)
 _TINY = 1e-12
 _GRAZING = 1e-3  # smallest cosine by which the lobes are divided
+_VERY_NARROW = 800.0, 3200.0  # concentrations below which stored visibility hides a lobe, and above which rays do
 WIDE, NARROW = 8.0, 32.0  # concentrations below which harmonics represent a lobe, and above which rays do
 
 
@@ -417,7 +418,20 @@ def _check(direction: Array, mass: Array, wo: np.ndarray, point: tuple) -> None:
 @jit
 def traced_share(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Share of a lobe that is traced by rays: 0 for wide lobes, 1 for narrow ones, with a smooth step between."""
-    place = jnp.clip(jnp.log(concentration / WIDE) / math.log(NARROW / WIDE), 0, 1)
+    return _step(concentration, WIDE, NARROW)
+
+
+@jit
+def traced_visibility(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """Share of a lobe whose visibility is that of rays: 0 for wide lobes, 1 for very narrow ones, with a smooth step.
+
+    Stored visibility hides the rest. A lobe within which light varies is not as visible as its few rays are.
+    """
+    return _step(concentration, *_VERY_NARROW)
+
+
+def _step(concentration: Float[Array, "*b"], wide: float, narrow: float) -> Float[Array, "*b"]:
+    place = jnp.clip(jnp.log(concentration / wide) / math.log(narrow / wide), 0, 1)
     return place**2 * (3 - 2 * place)
 
 
