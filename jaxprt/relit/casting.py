@@ -70,7 +70,7 @@ class Caster:
         # Hits of the ray's own triangle, or of a triangle around its own vertex, reflect nothing: the origin may lie
         # below it. A point's own triangle hides what is below it, as where normals of vertices face away from it.
         same = self.face[hit] == corner[point]
-        itself = np.any(same, 1) if at_vertices else np.all(same, 1)
+        itself = (hit >= 0) & (np.any(same, 1) if at_vertices else np.all(same, 1))
         triangle[ray, point], barycentric[ray, point] = np.where(itself, -1 if at_vertices else -2, hit), weight
         return triangle, barycentric, start
 

@@ -90,6 +90,21 @@ def test_a_ball_spreads_the_cone_of_a_ray_as_its_curvature_says():
     assert np.all(spread <= 1)
 
 
+def test_a_ray_from_a_point_ends_in_nothing_in_a_back_or_in_its_own_triangle():
+    plane, count = mesh("floor"), len(mesh("floor").face)
+    position, face = np.asarray(plane.position), np.asarray(plane.face)
+    above = make_mesh(np.concatenate([position, position + [0, 1, 0]]), np.concatenate([face, face + len(position)]))
+    points = on_triangles(face, np.arange(count), np.full((count, 3), 1 / 3, np.float32))
+    way = jnp.broadcast_to(jnp.array([[[0.0, 1.0, 0.0]], [[0.0, -1.0, 0.0]]]), (2, count, 3))
+    rays = traced.ReflectionRays(
+        way, jnp.zeros((2, count), jnp.int32), jnp.ones((2, count)), jnp.full((2, count), 50.0)
+    )
+    for scene, upward in ((plane, -1), (above, -2)):
+        triangle, _, _ = casting.Caster(scene).cast(rays, points, at_vertices=False)
+        np.testing.assert_array_equal(triangle[0], upward)
+        np.testing.assert_array_equal(triangle[1], -2)
+
+
 def mirrored(place: np.ndarray) -> np.ndarray:
     """How far inside of the wall the mirrored ray from the eye through a point of the floor hits; outside below 0."""
     way = place - np.asarray(EYE)
