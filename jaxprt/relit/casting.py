@@ -54,7 +54,8 @@ class Caster:
     ) -> tuple[Int[np.ndarray, "j v"], Float[np.ndarray, "j v 3"], Float[np.ndarray, "v 3"]]:
         """The triangle that each ray hits, barycentric weights of the hit, and origins of the rays.
 
-        The triangle is -1 for a ray that hits none, and -2 for a ray that hits a back.
+        The triangle is -1 for a ray that hits none or is not cast, -2 for one that hits a back or the triangle of its
+        point, and -3 for one that hits a triangle around its vertex.
 
         Args:
             rays: ReflectionRays that start from vertices or points.
@@ -69,9 +70,10 @@ class Caster:
         hit, weight = first_fronts(self.occluder, self.normal, start[point], np.ascontiguousarray(way[ray, point]))
         # Hits of the ray's own triangle, or of a triangle around its own vertex, reflect nothing: the origin may lie
         # below it. A point's own triangle hides what is below it, as where normals of vertices face away from it.
+        # Vertices are on several triangles, of which one may be in the way.
         same = self.face[hit] == corner[point]
         itself = (hit >= 0) & (np.any(same, 1) if at_vertices else np.all(same, 1))
-        triangle[ray, point], barycentric[ray, point] = np.where(itself, -1 if at_vertices else -2, hit), weight
+        triangle[ray, point], barycentric[ray, point] = np.where(itself, -3 if at_vertices else -2, hit), weight
         return triangle, barycentric, start
 
     def spread(
@@ -97,6 +99,7 @@ class Caster:
         """
         chance = np.asarray(rays.chance)
         cone = 1 / (np.asarray(rays.concentration) * np.maximum(len(chance) * chance, 1))
+        triangle = np.maximum(triangle, 0)
         corner = np.asarray(self.mesh.position)[self.face[triangle]]
         distance = np.linalg.norm(np.einsum("jvk,jvki->jvi", barycentric, corner) - start, axis=-1)
         return np.minimum(cone * (1 + 2 * distance * self.bend[triangle]) ** 2, 1).astype(np.float32)

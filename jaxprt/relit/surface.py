@@ -105,7 +105,7 @@ def view(
             `jaxprt.systems.lobe.widened`.
         glows: Whether emission is seen. Reflection rays do not see it, because they add lamps separately.
         lamps: The transport of the lamps to the points; None to interpolate it between vertices.
-        missed: Share of the reflection rays of narrow lobes that hit nothing; see `jaxprt.lobe.view_lobes`.
+        missed: Share of the reflection rays of narrow lobes that hit nothing; see `LobeSystem.view`.
     """
     points = points.tilted(look.normal)
     blend, emitted = material(surface, points, look, fixed)
@@ -187,7 +187,7 @@ def view_of(
         sharp: 1 where narrow lobes are traced by rays, 0 elsewhere; None for a group without rays.
         variance: Variance in squared radians by which lobes are widened; see `jaxprt.systems.lobe.widened`.
         lamps: The transport of the lamps to the points; None to interpolate it between vertices.
-        missed: Share of the reflection rays of narrow lobes that hit nothing; see `jaxprt.lobe.view_lobes`.
+        missed: Share of the reflection rays of narrow lobes that hit nothing; see `LobeSystem.view`.
     """
     system, reflecting, lit = surface.system, surface.reflecting, surface.lit
     reflected = None if reflecting is None else reflecting.view(eye, blend, points, sharp)

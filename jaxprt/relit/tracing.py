@@ -2,9 +2,9 @@
 
 Rays start from vertices or points and follow the narrow lobes of `jaxprt.systems.bounces.traced`. Each ray reads the
 radiance of the front face that it hits: direct light, and light that was reflected before, represented by 16 harmonics.
-Rays that hit nothing or a back face contribute nothing, because light of the environment is already part of direct
-light: their share is the visibility of very narrow lobes there. Rays that hit a lamp determine how much of it is
-visible in the reflection.
+Rays that hit nothing contribute nothing, because light of the environment is already part of direct light: their share
+is the visibility of very narrow lobes there. Rays that hit a back face are black. Rays that hit a lamp determine how
+much of it is visible in the reflection.
 
 Embree casts the rays on the host, once for each eye position and roughness. The hit points are constants. Radiance is
 therefore differentiable in the light and in the colors of all materials. Derivatives with respect to the eye or to
@@ -162,7 +162,7 @@ def trace(stage: Stage, origins: Sequence[RayOrigins], eye: Float[Array, "3"], *
     paths = []
     for origin, (bundle, missed), slot, (triangle, *_) in zip(origins, rays, slots, hits, strict=True):
         weight = _reflecting(stage, origin).weights(bundle, eye, origin.blend, origin.on_group, origin.share)
-        part = np.where(triangle >= 0, stage.part[cast.face[triangle, 0]], -1)
+        part = _parts(stage, cast, triangle)
         lamp = _lamps(stage, origin, part, weight, bundle.concentration)
         paths.append(PathWeights(slot, weight, lamp, missed))
     return Reflections(tuple(paths), rows)
@@ -177,8 +177,14 @@ def _shared(rays: ReflectionRays, turn: Int[np.ndarray, " v"]) -> ReflectionRays
 
 def _missed(narrow: Float[np.ndarray, "j v"], triangle: Int[np.ndarray, "j v"]) -> Float[Array, " v"]:
     """Share of the rays of narrow lobes that hit nothing, at each vertex or point; -1 where there are none."""
-    total, free = narrow.sum(0), (narrow * (triangle == -1)).sum(0)
+    # Rays that hit a triangle around their own vertex do not count.
+    total, free = ((narrow * counts).sum(0) for counts in (triangle > -3, triangle == -1))
     return put(np.where(total > 0, free / np.where(total > 0, total, 1), -1).astype(narrow.dtype))
+
+
+def _parts(stage: Stage, cast: Caster, triangle: Int[np.ndarray, "*b"]) -> Int[np.ndarray, "*b"]:
+    """Indices of the parts that rays hit; -1 for none."""
+    return np.where(triangle >= 0, stage.part[cast.face[np.maximum(triangle, 0), 0]], -1)
 
 
 def _reflecting(stage: Stage, origin: RayOrigins) -> ReflectingPart:
@@ -237,7 +243,7 @@ def _rows(stage: Stage, cast: Caster, hits: Sequence[tuple], *, keep: bool) -> t
     weight = np.concatenate([np.zeros((0, 3), np.float32), *(hit[1].reshape(-1, 3) for hit in hits)])
     start = np.concatenate([np.zeros((0, 3), np.float32), *(np.tile(hit[2], (len(hit[0]), 1)) for hit in hits)])
     variance = np.concatenate([np.zeros(0, np.float32), *(hit[3].ravel() for hit in hits)])
-    part = np.where(triangle >= 0, stage.part[cast.face[triangle, 0]], -1)
+    part = _parts(stage, cast, triangle)
     owner = np.where(part >= 0, stage.layout.group[part], -1)
     slot, rows, total = np.full(len(triangle), -1, np.int32), [], 0
     for group in range(len(stage.surfaces)):

@@ -138,7 +138,8 @@ class System(eqx.Module):
     def lobe_part(self) -> Any:
         """The `jaxprt.lobe.LobeSystem` whose lobes `view` widens by a variance; None if it has none.
 
-        `view` then takes the variance as a third argument.
+        `view` then takes keyword arguments: the variance at points that reflection rays hit, and at others what they
+        missed, the share of the rays of narrow lobes that hit nothing. See `LobeSystem.view`.
         """
         return None
 

@@ -103,6 +103,10 @@ def test_a_ray_from_a_point_ends_in_nothing_in_a_back_or_in_its_own_triangle():
         triangle, _, _ = casting.Caster(scene).cast(rays, points, at_vertices=False)
         np.testing.assert_array_equal(triangle[0], upward)
         np.testing.assert_array_equal(triangle[1], -2)
+        vertices = on_triangles(face, np.arange(count), np.eye(3, dtype=np.float32)[np.zeros(count, int)])
+        triangle, _, _ = casting.Caster(scene).cast(rays, vertices, at_vertices=True)
+        np.testing.assert_array_equal(triangle[0], upward)
+        np.testing.assert_array_equal(triangle[1], -3)
 
 
 def mirrored(place: np.ndarray) -> np.ndarray:

@@ -70,6 +70,22 @@ def test_radiance_is_that_of_all_texels(name, visible, transport, tables, light,
     close(color[seen], all_texels(visible, BRDFS[name], light)[seen], tolerance=COARSE[name])
 
 
+def test_rays_that_hit_nothing_are_what_an_open_plane_sees(tables, close):
+    """Narrow lobes fall short of the horizon, at grazing angles too, so that rays need not know it."""
+    plane = lobe.precompute(builtin.plane(cells=1), size=64, run=prt.visibility.Run(progress=False))
+    height = np.array([0.011, 0.02, 0.04, 0.9])
+    way = np.stack([np.sqrt(1 - height**2), height, 0 * height], 1)
+    eye = jnp.asarray(np.asarray(plane.position) + 10 * way, jnp.float32)
+
+    def seen(missed):
+        view = lobe.system.view_lobes(plane, tables["sharp"], eye=eye, missed=missed)
+        return jnp.sum(view.weight[0] * sum(view.visible), 0)
+
+    close(seen(jnp.ones(4)), seen(None), tolerance=0.015)
+    assert seen(jnp.zeros(4))[0] < 0.2 * seen(None)[0]
+    np.testing.assert_array_equal(seen(-jnp.ones(4)), seen(None))
+
+
 def test_light_that_grows_towards_the_open_side_counts_more():
     """Half of a lobe is seen, the bright half: the product of means is off by the covariance, which slopes bring."""
     center = np.asarray(cubemap.direction(size=SIZE), np.float64).reshape(-1, 3)
