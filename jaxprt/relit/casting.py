@@ -68,9 +68,8 @@ class Caster:
         ray, point = np.nonzero(chance > 0)
         triangle, barycentric = np.full(chance.shape, -1), np.zeros((*chance.shape, 3), np.float32)
         hit, weight = first_fronts(self.occluder, self.normal, start[point], np.ascontiguousarray(way[ray, point]))
-        # Hits of the ray's own triangle, or of a triangle around its own vertex, reflect nothing: the origin may lie
-        # below it. A point's own triangle hides what is below it, as where normals of vertices face away from it.
-        # Vertices are on several triangles, of which one may be in the way.
+        # A ray enters its point's own triangle where the shading normal leans away from it: nothing is seen below.
+        # A vertex may lie below one of its own triangles, and what that hides is not known.
         same = self.face[hit] == corner[point]
         itself = (hit >= 0) & (np.any(same, 1) if at_vertices else np.all(same, 1))
         triangle[ray, point], barycentric[ray, point] = np.where(itself, -3 if at_vertices else -2, hit), weight

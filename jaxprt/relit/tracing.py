@@ -2,9 +2,9 @@
 
 Rays start from vertices or points and follow the narrow lobes of `jaxprt.systems.bounces.traced`. Each ray reads the
 radiance of the front face that it hits: direct light, and light that was reflected before, represented by 16 harmonics.
-Rays that hit nothing contribute nothing, because light of the environment is already part of direct light: their share
-is the visibility of very narrow lobes there. Rays that hit a back face are black. Rays that hit a lamp determine how
-much of it is visible in the reflection.
+Back faces are black. Rays that hit nothing read nothing, because light of the environment is already part of direct
+light; direct light takes the share of such rays for the visibility of very narrow lobes. Rays that hit a lamp determine
+how much of it is visible in the reflection.
 
 Embree casts the rays on the host, once for each eye position and roughness. The hit points are constants. Radiance is
 therefore differentiable in the light and in the colors of all materials. Derivatives with respect to the eye or to
@@ -177,7 +177,7 @@ def _shared(rays: ReflectionRays, turn: Int[np.ndarray, " v"]) -> ReflectionRays
 
 def _missed(narrow: Float[np.ndarray, "j v"], triangle: Int[np.ndarray, "j v"]) -> Float[Array, " v"]:
     """Share of the rays of narrow lobes that hit nothing, at each vertex or point; -1 where there are none."""
-    # Rays that hit a triangle around their own vertex do not count.
+    # Rays that hit a triangle around their own vertex do not tell what is behind it.
     total, free = ((narrow * counts).sum(0) for counts in (triangle > -3, triangle == -1))
     return put(np.where(total > 0, free / np.where(total > 0, total, 1), -1).astype(narrow.dtype))
 

@@ -107,6 +107,13 @@ def test_a_ray_from_a_point_ends_in_nothing_in_a_back_or_in_its_own_triangle():
         triangle, _, _ = casting.Caster(scene).cast(rays, vertices, at_vertices=True)
         np.testing.assert_array_equal(triangle[0], upward)
         np.testing.assert_array_equal(triangle[1], -3)
+    face = np.array([[0, 1, 2]])
+    alone = casting.Caster(make_mesh(position[np.asarray(plane.face)[0]], face))
+    points = on_triangles(face, np.array([0]), np.full((1, 3), 1 / 3, np.float32))
+    rays = jax.tree.map(lambda rows: rows[:, :1], rays)
+    hit = alone.cast(rays, points, at_vertices=False)
+    np.testing.assert_array_equal(hit[0], [[-1], [-2]])
+    assert np.isfinite(alone.spread(rays, *hit)).all()
 
 
 def mirrored(place: np.ndarray) -> np.ndarray:

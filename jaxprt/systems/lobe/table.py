@@ -425,7 +425,8 @@ def traced_share(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
 def traced_visibility(concentration: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Share of a lobe whose visibility is that of rays: 0 for wide lobes, 1 for very narrow ones, with a smooth step.
 
-    Stored visibility hides the rest. A lobe within which light varies is not as visible as its few rays are.
+    Stored visibility counts for the rest of the lobe. Light varies within lobes that are not very narrow, so that a few
+    rays do not tell how much of it arrives.
     """
     return _step(concentration, *_VERY_NARROW)
 
