@@ -234,6 +234,11 @@ class TexturedMaterial(eqx.Module):
         """All textures of the material."""
         return tuple(value for value in vars(self).values() if isinstance(value, Texture))
 
+    @property
+    def oriented(self) -> Texture | None:
+        """The texture whose values have directions: the normal map, or that of the anisotropy."""
+        return self.normal_texture or self.anisotropy_texture
+
     @jit
     def at(
         self,

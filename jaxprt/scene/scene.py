@@ -11,16 +11,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxprt import require
+from jaxprt.compile import known
 from jaxprt.scene import material, mesh
 from jaxprt.scene import mesh as meshes
 from jaxprt.scene import origin as origins
 from jaxprt.scene.camera import Camera, orbit
 from jaxprt.scene.environment import Environment, Sun
 from jaxprt.scene.material import MaterialValues, TexturedMaterial
-from jaxprt.scene.mesh import Mesh
+from jaxprt.scene.mesh import Mesh, brush
+from jaxprt.scene.texture import dpdu, handedness
 
 _EDGE = 1e-3  # smallest difference of the cosines of a cone's angles, as in KHR_lights_punctual
 _ROUNDING = 1e-6  # by which float32 may round pi upward
@@ -37,8 +39,9 @@ class Part(eqx.Module):
         material: A material with textures, or any BRDF: a callable (wi, wo) -> value in 1/sr.
         color: Linear vertex colors, which multiply the base color; None for white.
         second: Second set of texture coordinates (`Mesh.texture` is the first); None if there is none.
-        handedness: 1 where the bitangent of the textures is cross(normal, tangent), and -1 where it is opposite; None
-            for 1 everywhere.
+        handedness: 1 where the bitangent of the textures is cross(normal, tangent), and -1 where it is opposite. If it
+            is None and the material has a normal map or anisotropy, the tangents of the mesh become those along u of
+            the texture, with their handedness.
         alpha: Opacity of the vertices, from 0 to 1, which multiplies that of the material; None for 1.
 
     Raises:
@@ -55,6 +58,17 @@ class Part(eqx.Module):
     second: Float[Array, "v 2"] | None = eqx.field(converter=require.floating, default=None)
     handedness: Float[Array, " v"] | None = eqx.field(converter=require.floating, default=None)
     alpha: Float[Array, " v"] | None = eqx.field(converter=require.floating, default=None)
+
+    def __post_init__(self):
+        """Turns tangents along the texture of a normal map, or of anisotropy, where no handedness is given."""
+        if not isinstance(self.material, TexturedMaterial) or not isinstance(self.mesh, Mesh):
+            return  # refused below, or a BRDF
+        source = self.material.oriented
+        place = self.second if source is not None and source.set else self.mesh.texture
+        turns = source is not None or not known(self.material.anisotropy) or np.asarray(self.material.anisotropy) > 0
+        if turns and self.handedness is None and _placed(self.mesh, place):
+            self.mesh, hand = along_texture(self.mesh, place)
+            self.handedness = jax.device_put(np.asarray(hand, np.float32))
 
     def __check_init__(self):
         """Refuses a wrong type of name or mesh, a mesh without vertices, and arrays of other vertices."""
@@ -99,6 +113,33 @@ class Part(eqx.Module):
         place = self.mesh.texture
         place = jnp.zeros((len(self.mesh.position), 2), self.mesh.position.dtype) if place is None else place
         return material.at(place, self.second, color=self.color, handedness=self.handedness)
+
+
+def _placed(of: Mesh, place: Any) -> bool:
+    """Whether a mesh and its texture coordinates are known and right."""
+    count, face = len(of.position), of.face
+    if place is None or np.shape(place) != (count, 2) or not known(of, place) or not len(face):
+        return False
+    return bool(np.min(face) >= 0 and np.max(face) < count and np.isfinite(np.asarray(place)).all())
+
+
+def along_texture(
+    of: Mesh, place: ArrayLike, *, stated: Bool[np.ndarray, " v"] | None = None, side: ArrayLike | None = None
+) -> tuple[Mesh, Float[np.ndarray, " v"]]:
+    """A mesh with tangents along u of a texture, and the handedness of the texture at all vertices.
+
+    Args:
+        of: The mesh.
+        place: Texture coordinates of the vertices.
+        stated: Vertices that keep their tangents; None for none.
+        side: Handedness of these; 1 if None.
+    """
+    image = dataclasses.replace(of, texture=jnp.asarray(place, jnp.float32))
+    along, hand = dpdu(image), handedness(image)
+    if stated is not None:
+        along = np.where(stated[:, None], of.tangent, along)
+        hand = np.where(stated, 1 if side is None else side, hand)
+    return brush(of, along), hand
 
 
 def _place(value: Any) -> Any:

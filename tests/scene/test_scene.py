@@ -106,6 +106,24 @@ def test_impossible_scenes_are_refused_by_name(build, kind, message):
         build()
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_frames_of_normal_maps_lie_along_the_texture_unless_their_handedness_is_given(mirrored, close):
+    mesh = textured()
+    place = np.asarray(mesh.texture)[:, ::-1] * [-1 if mirrored else 1, -1]  # u along y, or along -y
+    mesh = make_mesh(mesh.position, mesh.face, texture=place)
+    bumps = {"normal_texture": Texture(jnp.full((1, 1, 3), 0.5))}
+    part = Part("sheet", mesh, TexturedMaterial(**bumps))
+    along, hand = ([0.0, -1, 0], -1) if mirrored else ([0.0, 1, 0], 1)
+    close(part.mesh.tangent, [along] * 3, tolerance=1e-6)
+    np.testing.assert_array_equal(part.handedness, [hand] * 3)
+    given = Part("sheet", mesh, TexturedMaterial(**bumps), handedness=np.ones(3))
+    smooth = Part("sheet", mesh, TexturedMaterial(roughness=0.3))
+    for kept in (given, smooth):
+        np.testing.assert_array_equal(kept.mesh.tangent, mesh.tangent)
+    brushed = Part("sheet", mesh, TexturedMaterial(anisotropy=0.5))
+    np.testing.assert_array_equal(brushed.mesh.tangent, part.mesh.tangent)
+
+
 @pytest.mark.parametrize("suffix", ["ply", "stl", "off"])
 def test_files_without_materials_are_one_matte_gray_part(tmp_path, suffix):
     trimesh.creation.icosphere(subdivisions=1).export(tmp_path / f"ball.{suffix}")

@@ -7,17 +7,15 @@ from collections.abc import Callable, Collection, Hashable, Sequence
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from jaxprt import require
 from jaxprt.files import images, inputs
-from jaxprt.scene import texture
 from jaxprt.scene.formats.geometry import Geometry, MeshContent, rows_of
 from jaxprt.scene.material import Texture, TexturedMaterial
-from jaxprt.scene.mesh import Mesh, brush, from_file, split
-from jaxprt.scene.scene import Part, unique_names
+from jaxprt.scene.mesh import Mesh, from_file, split
+from jaxprt.scene.scene import Part, along_texture, unique_names
 
 FLIP = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])  # converts between v up and v down
 _GRAY = 0.5  # base color of surfaces without material and color
@@ -202,22 +200,13 @@ def _part(name: str, mesh: Mesh, material: TexturedMaterial, geometry: Geometry,
     if 0 in sets and mesh.texture is None:
         zero = _array(np.zeros((len(mesh.position), 2)))
         mesh = eqx.tree_at(lambda m: m.texture, mesh, zero, is_leaf=lambda m: m is None)
-    source = material.normal_texture or material.anisotropy_texture
+    source = material.oriented
     place = second if source is not None and source.set else mesh.texture
     if place is not None and (source is not None or material.anisotropy > 0):
         stated = np.zeros(len(place), bool) if geometry.tangent is None else (geometry.tangent[vertex] != 0).any(axis=1)
-        mesh, side = _with_tangents(mesh, place, stated, side)
+        mesh, side = along_texture(mesh, place, stated=stated, side=side)
     alpha = None if material.alpha_mode == "opaque" else rows(geometry.alpha, 1)
     return Part(name, mesh, material, _array(rows(geometry.color, 1)), _array(second), _array(side), _array(alpha))
-
-
-def _with_tangents(
-    mesh: Mesh, place: np.ndarray | Array, stated: np.ndarray, side: np.ndarray | None
-) -> tuple[Mesh, np.ndarray]:
-    """The mesh with tangents along u where the file has none, and the handedness of all vertices."""
-    image = Mesh(mesh.position, mesh.face, mesh.normal, mesh.tangent, mesh.region, jnp.asarray(place, jnp.float32))
-    along = np.where(stated[:, None], mesh.tangent, texture.dpdu(image))
-    return brush(mesh, along), np.where(stated, 1 if side is None else side, texture.handedness(image))
 
 
 def _array(value: np.ndarray | Array | None) -> Array | None:
