@@ -78,7 +78,7 @@ def precompute(
             alone. What rays hit is seen with the light that it reflects, one bounce more than `bounces`. Only used with
             bounces; see `RelitScene.with_rays`.
         refine: Largest relative L2 error that interpolation between vertices may cause in pictures, as `jaxprt.refine`
-            defines it; True for 0.015, False to keep the mesh. `RelitScene.mesh` is the divided mesh, and
+            defines it; True for 0.008, False to keep the mesh. `RelitScene.mesh` is the divided mesh, and
             `RelitScene.file_vertex` says which of its vertices are those of the scene. What is known of the lights,
             `environments`, makes it sharper.
         vertices: Largest number of vertices after division, with a warning where it is met. If None, twice as many as

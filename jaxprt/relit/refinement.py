@@ -18,7 +18,7 @@ from jaxprt.scene.subdivision import Division
 from jaxprt.visibility import blocks, refinement
 from jaxprt.visibility.occluder import check
 
-ERROR = 0.015  # of pictures, by default
+ERROR, TOLERATED = 0.008, 0.015  # of pictures, by default, and above which the default warns
 _ROOM = 5_000  # vertices that division may add to a scene of few, by default
 
 
@@ -110,8 +110,10 @@ def divided(
     if isinstance(wanted, bool | np.bool_):
         if not wanted:
             return scene, None
-        wanted = ERROR
-    require.number("refine", wanted, 0.0)
+        wanted, tolerated = ERROR, TOLERATED
+    else:
+        require.number("refine", wanted, 0.0)
+        tolerated = float(wanted)
     count = sum(scene.counts)
     most = 2 * count + _ROOM if vertices is None else vertices
     require.count("vertices", most, least=1)
@@ -121,6 +123,7 @@ def divided(
         return scene, None
     lights = None if environments is None else [shadows.untraced(light) for light in environments]
     options = {"error": float(wanted), "vertices": most, "environments": lights, "progress": progress}
+    options |= {"tolerated": tolerated}
     division = _stored(scene, folder, options)
     return (subdivision.subdivide_scene(scene, division.steps), division) if division.face else (scene, None)
 
@@ -163,9 +166,9 @@ def _division(scene: Scene, key: str, options: dict) -> MeshDivision:
     return MeshDivision(key, face, origin, parent, counts, error)
 
 
-def _divisions(scene: Scene, **options) -> tuple[list[Division], float]:
-    mesh = scene.mesh
-    return refinement.divisions(mesh, mesh, views=_views(scene, mesh), **options)
+def _divisions(scene: Scene, *, error: float, **options) -> tuple[list[Division], float]:
+    mesh, options = scene.mesh, {"tolerated": error, **options}
+    return refinement.divisions(mesh, mesh, views=_views(scene, mesh), error=error, **options)
 
 
 def interpolation_error(scene: Scene) -> float:

@@ -148,7 +148,8 @@ def refine(
     Reference: Křivánek, Pattanaik, Žára 2004, "Adaptive mesh subdivision for precomputed radiance transfer". They
     compare the endpoints of each edge instead.
     """
-    options = {"error": error, "vertices": vertices, "environments": environments, "progress": progress}
+    options = {"error": error, "tolerated": error, "vertices": vertices, "environments": environments}
+    options |= {"progress": progress}
     check(mesh, "mesh")
     shadowing = mesh if occluder is None else relative(occluder, mesh.origin)
     return subdivision.subdivide(mesh, divisions(mesh, shadowing, views=cameras(mesh, (), ()), **options)[0])
@@ -159,6 +160,7 @@ def divisions(
     occluder: Mesh,
     *,
     error: float,
+    tolerated: float,
     vertices: int,
     environments: Sequence[Environment] | None,
     views: Sequence[Camera],
@@ -170,6 +172,7 @@ def divisions(
         mesh: As in `refine`.
         occluder: As in `refine`.
         error: As in `refine`.
+        tolerated: Error above which a warning is given.
         vertices: As in `refine`.
         environments: As in `refine`.
         views: Cameras whose pictures the error is of.
@@ -210,10 +213,10 @@ def divisions(
             result.append(edges.divide(marked))
             joint = edges.joints_after(result[-1])
             surface.divide(result[-1])
-    if error > 0:
+    if left > tolerated > 0:
         warnings.warn(
-            f"{count} vertices leave an error of {100 * left:.4g} % by interpolation, above the {100 * error:.2g} % "
-            f"asked for; at most {vertices} were allowed",
+            f"{count} vertices leave an error of {100 * left:.4g} % by interpolation, above the "
+            f"{100 * tolerated:.2g} % asked for; at most {vertices} were allowed",
             stacklevel=3,
         )
     return result, left
