@@ -33,6 +33,7 @@ from jaxprt.systems.protocol import Blend, System
 
 T = TypeVar("T")
 _FEWEST = 64  # vertices of a group
+_NARROW = 3  # samples along the edge of a bright texel from which on lobes are narrower than texels
 
 
 class Surface(eqx.Module):
@@ -352,6 +353,11 @@ class Stage(eqx.Module):
     def sharp_groups(self) -> list[int]:
         """Indices of the groups from which reflection rays start."""
         return [group for group in range(len(self.surfaces)) if _has_rays(self, group)]
+
+    def finer(self, group: int) -> bool:
+        """Whether lobes of a group are so narrow that they read texels which `shadows.sharpened` light has."""
+        samples = max(self.layout.of_group(group, self.samples))
+        return samples >= _NARROW and self.surfaces[group].system.lobe_part is not None
 
     def sharp_at(self, group: int, points: Points) -> Float[Array, " p"] | None:
         """1 at points of the scene whose narrow lobes are traced, 0 at others; None for a group without rays."""

@@ -193,7 +193,9 @@ class PictureView(eqx.Module):
     ) -> "PictureLight":
         """What arrives under an environment and a share of each lamp."""
         traced = _traced_light(self, environment)
-        arriving = finished(self.arriving(environment, None if traced is None else traced.rest, share), between)
+        arriving = self.arriving(environment, None if traced is None else traced.rest, share)
+        arriving = arriving._replace(direct=shadows.sharpened(self.stage, arriving.direct, environment))
+        arriving = finished(arriving, between)
         reflections = ()
         if self.reflected is not None:
             # What rays hit is shaded with interpolated visibility, in the whole light.
@@ -531,7 +533,7 @@ def _seen(
     """What does not depend on the light, for a row of points with their materials."""
     surface = sampled(surface_of(stage, row.group), 1)  # The view does not depend on the samples of bright texels.
     options = {"fixed": stage.fixed[row.group], "sharp": stage.sharp_at(row.group, points)}
-    options |= {"lamps": lamps, "missed": row.missed}
+    options |= {"lamps": lamps, "missed": row.missed, "finer": stage.finer(row.group)}
     return view(surface, on_group, stage.table.at(points), jnp.asarray(camera.eye), **options)
 
 

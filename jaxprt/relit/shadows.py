@@ -17,9 +17,10 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Float, Int, PyTree, UInt8
 
 from jaxprt.compile import compile_time, known, put
 from jaxprt.image.pixels import Pixels
@@ -32,6 +33,8 @@ from jaxprt.scene.panorama import Panorama
 from jaxprt.sphere import cubemap
 from jaxprt.systems import bright_texels
 from jaxprt.systems.bright_texels import BrightLight, BrightTexels, Squares
+from jaxprt.systems.lobe import blurred_light
+from jaxprt.systems.lobe.blurred_light import LobeLight
 from jaxprt.visibility import picture_rays
 
 TEXELS = 16  # number of traced texels
@@ -43,7 +46,7 @@ _CELL_RAYS = 128  # rays of a point to all cells beyond one for each, in proport
 _FEWER = 0.7  # share of the wanted rays with which a texel that was traced before is not traced again
 _KEPT, _MOST = 4, 4 * TEXELS  # number of views whose traced texels are kept, and of texels of each
 
-_FINER: weakref.WeakKeyDictionary[Panorama, np.ndarray] = weakref.WeakKeyDictionary()
+_FINER: weakref.WeakKeyDictionary[Panorama, dict[int, np.ndarray]] = weakref.WeakKeyDictionary()
 
 
 class TexelShares(eqx.Module):
@@ -109,7 +112,7 @@ def trace(mesh: Mesh, pixels: Pixels, width: int, environment: Environment, *, k
         return None
     whole = np.sum(np.asarray(environment.radiance, np.float64).sum(-1) * np.asarray(cubemap.solid_angle(size=size)))
     count = _counts(_MORE * flux[bright] / whole)
-    fine = _finer(environment)
+    fine = finer(environment, size=_FINE)
     direction = light_samples.in_texels(number[bright], fine, size=size, count=picture_rays.PLACES)
     share = np.zeros((len(number), len(pixels.triangle)), np.uint8)
     rays = picture_rays.TexelRays(direction, count)
@@ -210,14 +213,34 @@ def fixed(environment: Environment, shares: TexelShares) -> TracedLight:
     return TracedLight(rest, excess, shares)
 
 
-def _finer(light: Environment) -> Float[np.ndarray, "6 m m c"]:
-    """The light at the resolution at which the places of rays are drawn; its own texels if it knows no finer ones."""
-    size, panorama = light.radiance.shape[-2], light.panorama
-    if panorama is None or size >= _FINE or _FINE % size:
+def sharpened(stage: Stage, direct: tuple[PyTree, ...], environment: Environment) -> tuple[PyTree, ...]:
+    """The result of `groups.direct`, in groups with very narrow lobes with the finer texels of an environment."""
+
+    def with_texels(light: Any) -> Any:
+        if not isinstance(light, LobeLight):
+            return light
+        texels = None
+        if environment.panorama is not None and light.size == environment.radiance.shape[-2]:
+            texels = put(finer(environment, size=blurred_light.FINER * light.size))
+        return blurred_light.sharpened(light, texels)
+
+    return tuple(
+        jax.tree.map(with_texels, light, is_leaf=lambda part: isinstance(part, LobeLight))
+        if stage.finer(group)
+        else light
+        for group, light in enumerate(direct)
+    )
+
+
+def finer(light: Environment, *, size: int) -> Float[np.ndarray, "6 m m c"]:
+    """The light in faces with an edge of so many texels; its own texels if it knows no finer ones."""
+    edge, panorama = light.radiance.shape[-2], light.panorama
+    if panorama is None or edge >= size or size % edge:
         return np.asarray(light.radiance)
-    if panorama not in _FINER:
-        _FINER[panorama] = np.asarray(environments.finer(light, size=_FINE).radiance)
-    return _FINER[panorama]
+    known = _FINER.setdefault(panorama, {})
+    if size not in known:
+        known[size] = np.asarray(environments.finer(light, size=size).radiance)
+    return known[size]
 
 
 def _cast(mesh: Mesh, pixels: Pixels, width: int, rays: picture_rays.TexelRays) -> UInt8[np.ndarray, "t p"]:

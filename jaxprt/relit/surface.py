@@ -5,7 +5,7 @@ lamps and emission. Both are one program for each kind of group.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -78,7 +78,7 @@ class TexelLight(NamedTuple):
     samples: int
 
 
-@partial(kept, static=("glows",))
+@partial(kept, static=("glows", "finer"))
 def view(
     surface: Surface,
     points: Points,
@@ -91,6 +91,7 @@ def view(
     glows: bool = True,
     lamps: LampTransport | None = None,
     missed: Float[Array, " p"] | None = None,
+    finer: bool = False,
 ) -> Viewed:
     """All of the points' radiance that does not depend on the light.
 
@@ -106,10 +107,12 @@ def view(
         glows: Whether emission is seen. Reflection rays do not see it, because they add lamps separately.
         lamps: The transport of the lamps to the points; None to interpolate it between vertices.
         missed: Share of the reflection rays of narrow lobes that hit nothing; see `LobeSystem.view`.
+        finer: Whether very narrow lobes read texels that only `shadows.sharpened` light has.
     """
     points = points.tilted(look.normal)
     blend, emitted = material(surface, points, look, fixed)
-    seen = view_of(surface, eye, blend, points, sharp, variance=variance, lamps=lamps, missed=missed)
+    options = {"variance": variance, "lamps": lamps, "missed": missed, "finer": finer}
+    seen = view_of(surface, eye, blend, points, sharp, **options)
     sight = _sight(surface, points, eye, blend)
     return Viewed(points, seen, emitted if glows else jnp.zeros_like(emitted), sight)
 
@@ -165,7 +168,7 @@ def _sight(surface: Surface, points: Points, eye: Array, blend: Blend | None) ->
     return Sight(frame, directions.view(frame, position, eye), blend, above)
 
 
-@jit
+@partial(jit, static_argnames=("finer",))
 def view_of(
     surface: Surface,
     eye: Float[Array, "*p 3"],
@@ -176,6 +179,7 @@ def view_of(
     variance: Array | None = None,
     lamps: LampTransport | None = None,
     missed: Float[Array, " p"] | None = None,
+    finer: bool = False,
 ) -> tuple[PyTree, PyTree, PyTree]:
     """The view of all systems of a group at points on it.
 
@@ -188,6 +192,7 @@ def view_of(
         variance: Variance in squared radians by which lobes are widened; see `jaxprt.systems.lobe.widened`.
         lamps: The transport of the lamps to the points; None to interpolate it between vertices.
         missed: Share of the reflection rays of narrow lobes that hit nothing; see `LobeSystem.view`.
+        finer: Whether very narrow lobes read texels that only `shadows.sharpened` light has.
     """
     system, reflecting, lit = surface.system, surface.reflecting, surface.lit
     reflected = None if reflecting is None else reflecting.view(eye, blend, points, sharp)
@@ -198,7 +203,9 @@ def view_of(
         lit = lit.view(eye, blend, points, sharp)
     if variance is not None and widened.can_widen(system):
         return widened.view(system, eye, blend, points, variance), reflected, lit
-    options = {} if missed is None or system.lobe_part is None else {"missed": missed}
+    options: dict[str, Any] = {} if missed is None else {"missed": missed}
+    options |= {"finer": True} if finer else {}
+    options = {} if system.lobe_part is None else options
     return system.view(eye, blend, points, **options), reflected, lit
 
 

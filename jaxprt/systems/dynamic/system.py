@@ -104,11 +104,12 @@ class DynamicSystem(protocol.VertexSystem):
         *,
         variance: Float[Array, " p"] | None = None,
         missed: Float[Array, " p"] | None = None,
+        finer: bool = False,
     ) -> DynamicView:
         """View factors of the terms, and texels at which each point reads the blurred light for its lobes.
 
         `variance`, in squared radians, widens the lobes of each point. It does not change the terms, and nor does
-        `missed`, the visibility of narrow lobes by rays; see `LobeSystem.view`.
+        `missed`, the visibility of narrow lobes by rays, and `finer`; see `LobeSystem.view`.
         """
         protocol.check_blend(materials)
         protocol.check_points(points, self.vertices)
@@ -117,7 +118,7 @@ class DynamicSystem(protocol.VertexSystem):
         if materials is not None:
             materials.check(count, self.brdf.channels)
         wo = _direction(self.transport.position, self.transport.frame, points, eye)
-        lobes = self.lobe_part.view(eye, materials, points, variance=variance, missed=missed)
+        lobes = self.lobe_part.view(eye, materials, points, variance=variance, missed=missed, finer=finer)
         return DynamicView(self.brdf.view(wo, materials), lobes)
 
     def combine(self, light: DynamicLight, view: DynamicView, points: Points = VERTICES) -> Float[Array, "p c"]:

@@ -1,5 +1,6 @@
 """The light blurred by lobes of about a dozen widths, for lobes of any width to read. Wider blurs have fewer texels."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from functools import lru_cache
@@ -14,7 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxprt import require
-from jaxprt.compile import kept, known, linear
+from jaxprt.compile import jit, kept, known, linear
 from jaxprt.decompose import mixture
 from jaxprt.scene.environment import Environment
 from jaxprt.sphere import cubemap
@@ -28,6 +29,7 @@ _WIDEST = 1.3  # upper limit of widths, in radians
 _COARSE = 0.75  # largest edge of a texel, relative to the width
 REACH = 3.0  # radius of the blur kernel, in widths
 _BLOCK = 6 * 8**2  # directions that are projected at once
+FINER = 4  # times as many texels along an edge as the environment, for very narrow lobes
 _TILE = 4  # edge of the tiles in which blurred faces are computed, in texels
 
 
@@ -36,12 +38,13 @@ class LobeLight(eqx.Module):
 
     Attributes:
         pyramid: Texels of all widths, one after another, in units of radiance; each face has a border of its neighbors'
-            texels. Those of wide lobes follow if these read a light of their own.
+            texels. Those of wide lobes follow if these read a light of their own, and then those of `sharpened`.
         coefficient: Coefficients of the unblurred light, for the diffuse part; see `jaxprt.systems.lobe.diffuse`.
         size: Edge of the environment's cubemap faces in texels.
         irradiance: Irradiance / pi of the vertices; None before `LobeSystem.shade`.
         flux: Vector irradiance / pi of the vertices, for normals that normal maps tilt; None before
             `LobeSystem.tilted`.
+        finer: Whether there are texels that are finer than those of the environment; see `sharpened`.
     """
 
     pyramid: Float[Array, "c t"]
@@ -49,6 +52,7 @@ class LobeLight(eqx.Module):
     size: int = eqx.field(static=True)
     irradiance: Float[Array, "c v"] | None = None
     flux: Float[Array, "c 3 v"] | None = None
+    finer: bool = eqx.field(static=True, default=False)
 
 
 @require.arguments(light=protocol.one_light)
@@ -72,6 +76,45 @@ def prefilter(light: Environment) -> LobeLight:
     return LobeLight(pyramid, diffuse.coefficients(light.radiance), light.radiance.shape[1])
 
 
+@jit
+def sharpened(light: LobeLight, texels: Float[Array | np.ndarray, "6 m m c"] | None) -> LobeLight:
+    """The light with scales that are finer than its texels, for very narrow lobes.
+
+    What was taken out of a texel of the light is missing in its finer ones in the same share.
+
+    Args:
+        light: The blurred light of an environment, or of what is left of it.
+        texels: The environment in `FINER` times as many texels along an edge; None interpolates those of the light.
+    """
+    size, colors = light.size, len(light.pyramid)
+    rest = light.pyramid[:, : 6 * (size + 2) ** 2].T.reshape(6, size + 2, size + 2, colors)[:, 1:-1, 1:-1]
+    edge = FINER * size
+    if texels is None:
+        value = cubemap.lookup(rest, cubemap.direction(size=edge).astype(rest.dtype))
+    else:
+        mean = cubemap.reduced(texels, size=size)
+        share = jnp.where(mean != 0, rest / jnp.where(mean != 0, mean, 1), 0)
+        value = texels * jnp.repeat(jnp.repeat(share, FINER, 1), FINER, 2)
+    levels = [light.pyramid]
+    while edge > size:
+        levels.append(cubemap.pad(value).reshape(-1, colors).T)
+        edge //= 2
+        value = cubemap.reduced(value, size=edge)
+    return dataclasses.replace(light, pyramid=jnp.concatenate(levels, 1), finer=True)
+
+
+@lru_cache(maxsize=8)
+def finer_scales(size: int, *, before: int) -> Scales:
+    """Scales of `sharpened` light, the finest first. `before` is the number of texels of the light before that."""
+    scale = scales(size)
+    edge = np.array([FINER * size >> step for step in range(FINER.bit_length() - 1)], np.int32)
+    texels = 6 * (edge + 2) ** 2
+    start = before + np.cumsum(texels) - texels
+    spread = [_spread(np.sqrt(4 * np.pi / 6) / edge / 2), scale.spread]
+    joined = [np.concatenate(pair) for pair in ((edge, scale.edge), spread, (start.astype(np.int32), scale.start))]
+    return Scales(*joined, before + int(texels.sum()))
+
+
 @lru_cache(maxsize=8)
 def scales(size: int) -> Scales:
     """Scales of the blurred light: the environment itself, whose faces have edge `size`, and then every width."""
@@ -82,10 +125,13 @@ def scales(size: int) -> Scales:
     edge = [size] + [_edge(w, size, least=4) for w in width[1:]]
     edge = np.array(edge, np.int32)
     count = 6 * (edge + 2) ** 2
-    # The mean cosine is coth k - 1/k. For sharp lobes coth k is 1 to rounding.
-    sharpness = np.array(width) ** -2
-    spread = 1 - 1 / np.tanh(np.minimum(sharpness, 50)) + 1 / sharpness
-    return Scales(edge, spread, (np.cumsum(count) - count).astype(np.int32), int(count.sum()))
+    return Scales(edge, _spread(np.array(width)), (np.cumsum(count) - count).astype(np.int32), int(count.sum()))
+
+
+def _spread(width: np.ndarray) -> np.ndarray:
+    """Mean of 1 - cos over lobes of some widths. The mean cosine is coth k - 1/k, where coth k is 1 to rounding."""
+    sharpness = width**-2
+    return 1 - 1 / np.tanh(np.minimum(sharpness, 50)) + 1 / sharpness
 
 
 @kept

@@ -26,9 +26,9 @@ from jaxprt.sphere import cubemap, directions
 from jaxprt.systems import harmonic, protocol
 from jaxprt.systems.lobe import diffuse
 from jaxprt.systems.lobe import squares as over_squares
-from jaxprt.systems.lobe.blurred_light import LobeLight, prefilter, scales
+from jaxprt.systems.lobe.blurred_light import LobeLight, finer_scales, prefilter, scales
 from jaxprt.systems.lobe.exported import DEGREE, CoarseTransport, ExportedLobes
-from jaxprt.systems.lobe.pyramid import LobeTransport, between, corners
+from jaxprt.systems.lobe.pyramid import LobeTransport, Scales, between, corners
 from jaxprt.systems.lobe.table import LobeBrdf, LobeMixture, traced_visibility
 from jaxprt.systems.protocol import Blend
 
@@ -53,6 +53,7 @@ class LobeView(eqx.Module):
         size: Edge of the environment's cubemap faces in texels.
         mean: Unit directions of the lobes in local frames; None if wide lobes do not read a light of their own.
         concentration: Their concentrations.
+        finer: Whether very narrow lobes read texels that only `sharpened` light has.
     """
 
     place: tuple[Int[Array, "l v"], ...]
@@ -64,6 +65,7 @@ class LobeView(eqx.Module):
     size: int = eqx.field(static=True)
     mean: Float[Array, "3 l v"] | None = None
     concentration: Float[Array, "l v"] | None = None
+    finer: bool = eqx.field(static=True, default=False)
 
 
 class LobeSystem(protocol.VertexSystem):
@@ -122,14 +124,17 @@ class LobeSystem(protocol.VertexSystem):
         variance: Float[Array, " p"] | None = None,
         two_lights: bool = False,
         missed: Float[Array, " p"] | None = None,
+        finer: bool = False,
     ) -> LobeView:
         """Texels at which each point reads the blurred light, with visibility.
 
         `variance`, in squared radians, widens the lobes of each point. With `two_lights` the view is of such a light.
         `missed`, the share of the rays of narrow lobes that hit nothing, is the visibility of these; -1 without rays.
+        With `finer`, very narrow lobes read texels that only `sharpened` light has.
         """
         protocol.check_blend(materials)
-        options = {"eye": eye, "points": points, "variance": variance, "two_lights": two_lights, "missed": missed}
+        options = {"eye": eye, "points": points, "variance": variance, "two_lights": two_lights}
+        options |= {"missed": missed, "finer": finer}
         # The irradiance comes with the light: each row of points would hold a copy of the vectors.
         transport = eqx.tree_at(lambda stored: stored.vector, self.transport, self.transport.vector[:0])
         if materials is None:
@@ -237,6 +242,7 @@ def view_lobes(
     variance: Float[Array, " p"] | None = None,
     two_lights: bool = False,
     missed: Float[Array, " p"] | None = None,
+    finer: bool = False,
 ) -> LobeView:
     """Finds the texels of the blurred light that each vertex or point reads for a view, and their visibility.
 
@@ -251,14 +257,15 @@ def view_lobes(
         two_lights: Whether wide lobes read a light of their own; see `LobeSystem.two_lights`.
         missed: Share of the rays of narrow lobes that hit nothing, which is their visibility; -1 at points without
             rays. None without rays.
+        finer: Whether very narrow lobes read texels that only `sharpened` light has.
     """
     count = len(transport.position)
     protocol.check_points(points, count)
     eye = require.position("the eye", eye, points=points.count(count))
-    return _view_lobes(transport, brdf, parameter, eye, points, variance, missed, two_lights=two_lights)
+    return _view_lobes(transport, brdf, parameter, eye, points, variance, missed, two_lights=two_lights, finer=finer)
 
 
-@partial(jit, static_argnames=("two_lights",))
+@partial(jit, static_argnames=("two_lights", "finer"))
 def _view_lobes(
     transport: LobeTransport,
     brdf: LobeBrdf,
@@ -269,17 +276,20 @@ def _view_lobes(
     missed: Array | None,
     *,
     two_lights: bool,
+    finer: bool,
 ) -> LobeView:
     placing = *placed(transport.position, transport.frame, points), brdf, eye, variance
     lobe, (face, s, t, spread) = _places(*placing, *parameter)
     seen = transport.lobe_visibility(face, s, t, spread, points)
     if missed is not None:
         seen = _partly_traced(seen, missed, lobe.concentration)
-    place, visible = _taps(face, s, t, spread, lobe.concentration, seen, size=transport.size)
-    view = LobeView(place, visible, lobe.weight, lobe.diffuse, transport.vector, points, transport.size)
+    size, coarse = transport.size, scales(transport.size).total
+    before = coarse * (1 + two_lights) if finer else 0
+    place, visible = _taps(face, s, t, spread, lobe.concentration, seen, size=size, before=before)
+    view = LobeView(place, visible, lobe.weight, lobe.diffuse, transport.vector, points, size, finer=finer)
     if not two_lights:
         return view
-    after = jnp.where(_is_wide(lobe.concentration), scales(transport.size).total, 0)
+    after = jnp.where(_is_wide(lobe.concentration), coarse, 0)
     place = tuple(texel + after for texel in place)
     return dataclasses.replace(view, place=place, mean=lobe.mean, concentration=lobe.concentration)
 
@@ -309,17 +319,23 @@ def _places(
     return lobe, (*cubemap.project(*world), mixture.drop(lobe.concentration))
 
 
-@partial(isolated, static=("size",))
-def _taps(face, s, t, spread, concentration, visible, *, size: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """Texels of the blurred light that each lobe reads, and their weights."""
+@partial(isolated, static=("size", "before"))
+def _taps(
+    face, s, t, spread, concentration, visible, *, size: int, before: int
+) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Texels of the blurred light that each lobe reads, and their weights; with `before`, of a finer light."""
     seen, face, s, t, spread = _seen_part(visible, face, s, t, spread, concentration)
-    place, weight = zip(*_blurred(face, s, t, spread, size=size), strict=True)
+    scale = scales(size)
+    if before:
+        spread = jnp.where(_is_wide(concentration), jnp.maximum(spread, scale.spread[0]), spread)
+        scale = finer_scales(size, before=before)
+    place, weight = zip(*_blurred(face, s, t, spread, scale), strict=True)
     return place, tuple(seen * part for part in weight)
 
 
-def _blurred(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> list[tuple[Array, Array]]:
+def _blurred(face: Array, s: Array, t: Array, spread: Array, scale: Scales) -> list[tuple[Array, Array]]:
     """Texels of the light that is blurred by a spread, and their weights, which sum to 1."""
-    scale, result = scales(size), []
+    result = []
     number, upper = between(scale, spread)
     for step, part in ((0, 1 - upper), (1, upper)):
         edge, start = (jnp.asarray(x)[number + step] for x in (scale.edge, scale.start))
@@ -334,7 +350,7 @@ def _blurred(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> li
 def _upon(light: LobeLight, normal: Float[Array, "3 p"]) -> Float[Array, "c p"]:
     """What changes with the normal about as irradiance does without shadows: the light, widely blurred."""
     face, s, t = cubemap.project(*normal)
-    taps = _blurred(face, s, t, jnp.full_like(s, _FLANK), size=light.size)
+    taps = _blurred(face, s, t, jnp.full_like(s, _FLANK), scales(light.size))
     return reduce(jnp.add, (light.pyramid[:, texel] * part for texel, part in taps))
 
 
@@ -372,13 +388,15 @@ def combine(light: LobeLight, view: LobeView) -> Float[Array, "v e"]:
         Linear radiance of each vertex or point, in units of the light's radiance.
 
     Raises:
-        ValueError: The light has another size than the transport of the view.
+        ValueError: The light has another size than the transport of the view, or lacks the finer texels of the view.
     """
     if light.size != view.size:
         raise ValueError(
             f"the light's faces must have as many texels along an edge as the transport's, {view.size}, "
             f"got {light.size}"
         )
+    if view.finer and not light.finer:
+        raise ValueError("the light must be that of sharpened for a view with finer=True, got one of prefilter")
     protocol.check_colors(len(light.pyramid), view.weight.shape[0])
     irradiance = light.irradiance
     if irradiance is None:

@@ -1,5 +1,7 @@
 """Relighting by lobes against the sum over all texels."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -124,6 +126,31 @@ def test_blurred_light_is_the_mean_over_lobes(light):
         level = np.asarray(filtered.pyramid)[:, start : start + 6 * (edge + 2) ** 2].reshape(3, 6, edge + 2, edge + 2)
         value = level[:, :, 1:-1, 1:-1].reshape(3, -1).T
         assert np.linalg.norm(value - expected) < BLUR * np.linalg.norm(expected)
+
+
+def test_finer_scales_hold_the_texels_of_what_is_left_of_a_light(close):
+    """Taking half of each texel takes half of its finer ones; without these, the light is interpolated."""
+    finer, texels = lobe.blurred_light.FINER * SIZE, np.random.default_rng(0).uniform(0.5, 1, (6, SIZE, SIZE, 16, 3))
+    texels = np.float32(texels.reshape(6, SIZE, SIZE, 4, 4, 3).swapaxes(2, 3).reshape(6, finer, finer, 3))
+    whole = lobe.blurred_light.prefilter(Environment(cubemap.reduced(texels, size=SIZE)))
+    scale = lobe.blurred_light.finer_scales(SIZE, before=whole.pyramid.shape[1])
+    assert scale.edge[0] == finer
+    assert (np.diff(scale.edge) <= 0).all()
+    assert (np.diff(scale.spread) > 0).all()
+
+    def level(made, number):
+        edge, start = int(scale.edge[number]), int(scale.start[number])
+        rows = np.asarray(made.pyramid)[:, start : start + 6 * (edge + 2) ** 2]
+        return rows.T.reshape(6, edge + 2, edge + 2, 3)[:, 1:-1, 1:-1]
+
+    for share in (1.0, 0.5, 0.0):
+        left = dataclasses.replace(whole, pyramid=share * whole.pyramid)
+        made = lobe.blurred_light.sharpened(left, texels)
+        assert made.pyramid.shape[1] == scale.total
+        for number, edge in enumerate(scale.edge[:3].tolist()):
+            close(level(made, number), share * np.asarray(cubemap.reduced(texels, size=edge)), tolerance=1e-5)
+    even = lobe.blurred_light.prefilter(Environment(jnp.full((6, SIZE, SIZE, 3), 2.5)))
+    close(lobe.blurred_light.sharpened(even, None).pyramid, np.full((3, scale.total), 2.5), tolerance=1e-5)
 
 
 def test_constant_light_stays_constant_at_all_scales(close):
