@@ -59,7 +59,7 @@ class Map:
 class Material:
     """What a file says about a surface. Factors multiply maps; colors are linear.
 
-    Alpha covers by itself, or where it reaches `cutoff`.
+    Alpha covers by itself, or where it reaches `cutoff`. A `brdf` that `benchmarks.plugins` has replaces the formula.
     """
 
     base_color: np.ndarray = dataclasses.field(default_factory=lambda: np.ones(3))
@@ -82,6 +82,7 @@ class Material:
     emissive_map: Map | None = None
     normal_map: Map | None = None
     unjudged: tuple[str, ...] = ()
+    brdf: Any = None
 
     def maps(self) -> list[Map]:
         """All maps that it has."""

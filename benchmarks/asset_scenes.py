@@ -199,6 +199,8 @@ def unjudged(surface: Surface) -> set[str]:
 def _bsdf(mitsuba: Any, surface: Surface, model: str) -> Any:
     """Mitsuba's material, or what loads as one."""
     material = surface.material
+    if material.brdf is not None:
+        return plugins.bsdf(material.brdf)
     base = _product(mitsuba, surface, material.base_color, material.base_map, _COLOR)
     metallic = _product(mitsuba, surface, material.metallic, material.metallic_map)
     roughness = _product(mitsuba, surface, material.roughness, material.roughness_map)

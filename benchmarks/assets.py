@@ -367,7 +367,7 @@ def trace(request: dict[str, Any]) -> dict[str, Any]:
         if path is not None and path.is_file():
             with np.load(path) as kept:
                 known = kept["total"], int(kept["blocks"]), kept["sides"]
-        total, blocks, sides = _rendered(surfaces, light, request, drawn, known)
+        total, blocks, sides = rendered(surfaces, light, request, drawn, known)
         if path is not None:
             np.savez(path, total=total, blocks=blocks, sides=sides)
         halves.append(total / blocks)
@@ -375,7 +375,7 @@ def trace(request: dict[str, Any]) -> dict[str, Any]:
     return {"halves": halves, "samples": 2 * request["samples"], "sides": sides, "unjudged": unjudged}
 
 
-def _rendered(
+def rendered(
     surfaces: Sequence[asset_files.Surface],
     light: pathlib.Path,
     request: dict[str, Any],
