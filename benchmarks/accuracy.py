@@ -27,7 +27,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.spatial
+from scipy.spatial import KDTree
 
 import jaxprt as prt
 from benchmarks import asset_files, assets, denoised, harness
@@ -181,8 +181,8 @@ def materials(name: str) -> tuple[Any, asset_files.Material]:
         ours = TexturedMaterial(
             metallic=0.0, roughness=0.4, base_color_texture=Texture(color), normal_texture=Texture(normal)
         )
-        maps = {"base_map": Map(color), "normal_map": Map(normal)}
-        return ours, asset_files.Material(metallic=0.0, roughness=0.4, **maps)
+        theirs = {"base_map": Map(color), "normal_map": Map(normal), "metallic": 0.0, "roughness": 0.4}
+        return ours, asset_files.Material(**theirs)  # pyright: ignore[reportArgumentType]
     metallic, roughness = (0.0, 0.4) if name == "plastic" else (1.0, float(name.split()[1]))
     ours = MetallicRoughness(GOLD, metallic=metallic, roughness=roughness)
     return ours, asset_files.Material(color, metallic=metallic, roughness=roughness)
@@ -192,11 +192,11 @@ def images(edge: int = 128) -> tuple[np.ndarray, np.ndarray]:
     """Colors of large tiles, and the normals of bumps, as images [h w 3] that repeat."""
     row, column = 2 * np.pi * (np.indices((edge, edge)) + 0.5) / edge
     tile = (0.5 + 0.5 * np.tanh(4 * np.sin(2 * column) * np.sin(2 * row)))[..., None]
-    color = np.float32(tile * np.array(GOLD) + (1 - tile) * np.array([0.25, 0.3, 0.45]))
+    color = tile * np.array(GOLD) + (1 - tile) * np.array([0.25, 0.3, 0.45])
     slope = 0.35 * np.stack([np.cos(4 * column) * np.sin(4 * row), -np.sin(4 * column) * np.cos(4 * row)], -1)
     normal = np.concatenate([-slope, np.ones((edge, edge, 1))], -1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    return color, np.float32((normal + 1) / 2)
+    return color.astype(np.float32), ((normal + 1) / 2).astype(np.float32)
 
 
 def surface(mesh: Mesh, material: asset_files.Material) -> Surface:
@@ -256,7 +256,7 @@ def contact(subject: Subject, drawn: dict[str, Any], truth: denoised.Truth, halv
     """Relative L2 of the ground's pixels beside the mesh; None without a ground, or if none is seen."""
     mesh, picture = subject.scene.parts[0].mesh, np.asarray(drawn["color"])
     low, high = bounds(mesh)
-    distance, _ = scipy.spatial.cKDTree(np.asarray(mesh.position)).query(np.asarray(drawn["position"]))
+    distance, _ = KDTree(np.asarray(mesh.position)).query(np.asarray(drawn["position"]))
     beside = truth.inside & (np.asarray(drawn["part"]) == 1) & (distance < CONTACT * np.linalg.norm(high - low))
     if not beside.any():
         return None
@@ -296,8 +296,8 @@ def summary(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def tables(lines: Sequence[dict[str, Any]]) -> str:
     """Medians and largest errors over the meshes, by material and light; then the meshes; then the worst cases."""
-    rows = [(*line["case"].split(", "), line) for line in lines]
-    lights = [light for light in LIGHTS if any(row[2] == light for row in rows)]
+    rows = [(line["case"].split(", "), line) for line in lines]
+    lights = [light for light in LIGHTS if any(names[2] == light for names, _ in rows)]
 
     def cell(chosen: Sequence[dict[str, Any]], key: str = "error") -> str:
         values = [line[key] for line in chosen if line[key] is not None]
@@ -305,7 +305,7 @@ def tables(lines: Sequence[dict[str, Any]]) -> str:
 
     def select(**names: str) -> list[dict[str, Any]]:
         place = {"mesh": 0, "material": 1, "light": 2}
-        return [row[3] for row in rows if all(row[place[key]] == value for key, value in names.items())]
+        return [line for row, line in rows if all(row[place[key]] == value for key, value in names.items())]
 
     result = [["material", *lights, "all"]]
     for material in (name for name in MATERIALS if select(material=name)):
@@ -313,7 +313,7 @@ def tables(lines: Sequence[dict[str, Any]]) -> str:
         result.append([material, *each, cell(select(material=material))])
     result.append(["all", *(cell(select(light=light)) for light in lights), cell(lines)])
     other = [["mesh", "error", "contact shadows", "biased cells", "bias", "seconds"]]
-    for mesh in dict.fromkeys(row[0] for row in rows):
+    for mesh in dict.fromkeys(names[0] for names, _ in rows):
         chosen = select(mesh=mesh)
         bias = statistics.median(line["bias"] for line in chosen)
         seconds = statistics.median(line["seconds"] for line in chosen)

@@ -78,7 +78,7 @@ REASONS = {
         decompose.eigen.orientation decompose.tucker.orient systems.separable.factorization.mark_of
         systems.dynamic.reflected.stacked systems.bounces.gather.shares systems.bounces.gather.cosines
         systems.bounces.gather.measures systems.bounces.patches.divide brdf.places.columns scene.origin
-        scene.camera.localize scene.scene.centered scene.scene.default_camera scene.material.opacity_of_parts
+        scene.scene.along_texture scene.camera.localize scene.scene.centered scene.scene.default_camera scene.material.opacity_of_parts
         scene.texture.dpdu scene.texture.handedness scene.occluder scene.subdivision scene.light_samples scene.builtin
         benchmarks.published.interiors scene.camera.orbit scene.environment.resample scene.panorama scene.panorama_loops
         scene.environment.finer scene.environment.add_disk scene.environment.disk_share scene.environment.resized
@@ -108,6 +108,7 @@ REASONS = {
     "a NumPy table, or an index in one": """
         sphere.hats.centers sphere.hats.table sphere.hats.inverse_gram systems.lobe.pyramid.scales
         systems.lobe.pyramid.between systems.lobe.pyramid.corners systems.lobe.blurred_light.scales
+        systems.lobe.blurred_light.finer_scales
         visibility.members.places sphere.cubemap.axes brdf.measured.cell_angles brdf.measured.lower_cosine
         brdf.measured.tabulate sphere.cubemap.border_index sphere.harmonics.quadrature
     """,
@@ -668,6 +669,9 @@ EXAMPLES = {
     "systems.lobe.diffuse.coefficients": example(lambda draw: call(draw.normal(6, 8, 8, 3))),
     "systems.lobe.diffuse.irradiance": example(lambda draw: call(draw.normal(8, 3), draw.normal(8, 5))),
     "systems.lobe.blurred_light.prefilter": example(lambda draw: call(draw.light(8))),
+    "systems.lobe.blurred_light.sharpened": example(
+        lambda draw: call(lobe_system.blurred_light.prefilter(draw.light(8)), draw.light(32).radiance)
+    ),
     "systems.lobe.system.combine": example(
         lambda draw: call(
             lobe_system.blurred_light.prefilter(draw.light(8)),

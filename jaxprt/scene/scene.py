@@ -64,7 +64,7 @@ class Part(eqx.Module):
         if not isinstance(self.material, TexturedMaterial) or not isinstance(self.mesh, Mesh):
             return  # refused below, or a BRDF
         source = self.material.oriented
-        place = self.second if source is not None and source.set else self.mesh.texture
+        place: Any = self.second if source is not None and source.set else self.mesh.texture
         turns = source is not None or not known(self.material.anisotropy) or np.asarray(self.material.anisotropy) > 0
         if turns and self.handedness is None and _placed(self.mesh, place):
             self.mesh, hand = along_texture(self.mesh, place)
@@ -117,10 +117,11 @@ class Part(eqx.Module):
 
 def _placed(of: Mesh, place: Any) -> bool:
     """Whether a mesh and its texture coordinates are known and right."""
-    count, face = len(of.position), of.face
-    if place is None or np.shape(place) != (count, 2) or not known(of, place) or not len(face):
+    count = len(of.position)
+    if place is None or np.shape(place) != (count, 2) or not known(of, place) or not len(of.face):
         return False
-    return bool(np.min(face) >= 0 and np.max(face) < count and np.isfinite(np.asarray(place)).all())
+    face = np.asarray(of.face)
+    return bool(face.min() >= 0 and face.max() < count and np.isfinite(np.asarray(place)).all())
 
 
 def along_texture(

@@ -94,7 +94,7 @@ def sharpened(light: LobeLight, texels: Float[Array | np.ndarray, "6 m m c"] | N
     else:
         mean = cubemap.reduced(texels, size=size)
         share = jnp.where(mean != 0, rest / jnp.where(mean != 0, mean, 1), 0)
-        value = texels * jnp.repeat(jnp.repeat(share, FINER, 1), FINER, 2)
+        value = jnp.asarray(texels) * jnp.repeat(jnp.repeat(share, FINER, 1), FINER, 2)
     levels = [light.pyramid]
     while edge > size:
         levels.append(cubemap.pad(value).reshape(-1, colors).T)
@@ -110,9 +110,9 @@ def finer_scales(size: int, *, before: int) -> Scales:
     edge = np.array([FINER * size >> step for step in range(FINER.bit_length() - 1)], np.int32)
     texels = 6 * (edge + 2) ** 2
     start = before + np.cumsum(texels) - texels
-    spread = [_spread(np.sqrt(4 * np.pi / 6) / edge / 2), scale.spread]
-    joined = [np.concatenate(pair) for pair in ((edge, scale.edge), spread, (start.astype(np.int32), scale.start))]
-    return Scales(*joined, before + int(texels.sum()))
+    spread = np.concatenate([_spread(np.sqrt(4 * np.pi / 6) / edge / 2), scale.spread])
+    edge, start = np.concatenate([edge, scale.edge]), np.concatenate([start.astype(np.int32), scale.start])
+    return Scales(edge, spread, start, before + int(texels.sum()))
 
 
 @lru_cache(maxsize=8)
