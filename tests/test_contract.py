@@ -78,7 +78,8 @@ REASONS = {
         decompose.eigen.orientation decompose.tucker.orient systems.separable.factorization.mark_of
         systems.dynamic.reflected.stacked systems.bounces.gather.shares systems.bounces.gather.cosines
         systems.bounces.gather.measures systems.bounces.patches.divide brdf.places.columns scene.origin
-        scene.scene.along_texture scene.camera.localize scene.scene.centered scene.scene.default_camera scene.material.opacity_of_parts
+        scene.scene.along_texture
+        scene.camera.localize scene.scene.centered scene.scene.default_camera scene.material.opacity_of_parts
         scene.texture.dpdu scene.texture.handedness scene.occluder scene.subdivision scene.light_samples scene.builtin
         benchmarks.published.interiors scene.camera.orbit scene.environment.resample scene.panorama scene.panorama_loops
         scene.environment.finer scene.environment.add_disk scene.environment.disk_share scene.environment.resized
