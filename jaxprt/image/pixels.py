@@ -35,6 +35,8 @@ SMOOTH = math.cos(math.radians(10))  # smallest cosine between mean normals of t
 BLOCK = 1 << 15  # points and pixels per step, so that compiled programs fit any number of them
 SAME_DEPTH = 1e-4  # relative difference in depth that rounding may cause
 STEEPEST = 1e6  # slopes are clamped to that of a triangle a millionth of a pixel wide
+FACET = 4  # of `detail`
+_PLANE = math.cos(math.radians(1))  # in place of SMOOTH, for facets
 _RAYS = 1 << 16  # rays whose lists are held at once
 
 
@@ -75,10 +77,10 @@ def shading_points(
     """Finds one shading point for each pixel and each surface that the pixel shows.
 
     Samples of one triangle share a point. Samples of different triangles share a point if the triangles clearly form
-    one smooth surface: they have the same region, mean shading normals within ten degrees, and depths that differ by no
-    more than their slopes explain. A mesh finer than the pixels therefore has one point per pixel, not four. The point
-    lies at the mean position of its samples, or as close to it as the triangle of the first sample reaches. Surfaces
-    seen from behind (see `raster.front`) have no points. The result has zero derivatives.
+    one smooth surface: they have the same region, mean shading normals within ten degrees (one degree for facets), and
+    depths that differ by no more than their slopes explain. A mesh finer than the pixels therefore has one point per
+    pixel, not four. The point lies at the mean position of its samples, or as close to it as the triangle of the first
+    sample reaches. Surfaces seen from behind (see `raster.front`) have no points. The result has zero derivatives.
 
     Outside of `jax.jit` and `jax.vmap` the points are in NumPy, because their number depends on the view. At most an
     eighth of them is padding, so that programs compiled for one view often fit the next. Inside of `jax.jit` the number
@@ -89,7 +91,8 @@ def shading_points(
         mesh: The rasterized mesh.
         camera: The camera of the rasterization.
         detail: How much the radiance of each triangle varies within a pixel: 0 if one point is enough for a surface, 1
-            if each sample becomes a point, 2 if each becomes four; 0 for all if None.
+            if each sample becomes a point, 2 if each becomes four; 0 for all if None. With `FACET` added the triangle
+            is flat, and its reflection is sharp: in pixels that several such surfaces fill each sample becomes four.
         share: Share from 0 to 1 of each sample that sees its triangle, or the background; all of it if None. Coverage
             and background count it.
         occluder: The triangles of the mesh in its coordinates, to find four points of a sample by rays. Without it, or
@@ -109,10 +112,10 @@ def shading_points(
         raise ValueError(f"the fragments must refer to the mesh's {len(mesh.face)} triangles, got triangle {highest}")
     projected, block = _project(mesh, camera), min(BLOCK, 1 << (shape[0] * shape[1] - 1).bit_length())
     facing = raster.front_faces(mesh, camera)
-    uneven = jnp.zeros(len(mesh.face), bool) if detail is None else detail > 0
+    uneven = jnp.zeros(len(mesh.face), bool) if detail is None else detail % FACET > 0
     members, mixed, background = _uniform(fragments, facing, uneven)
     if len(shape) == 3:
-        face = facing, *_faces(mesh, projected), uneven
+        face = facing, *_faces(mesh, projected), uneven, jnp.zeros_like(uneven) if detail is None else detail >= FACET
         for row in _numbers(mixed, block):
             shown, samples = _samples(row, fragments, face)
             members = _merge(row, members, shown, _same(samples))
@@ -334,7 +337,7 @@ def _samples(row: Int[Array, " m"], fragments: Fragments, face: tuple[Array, ...
 @jit
 def _same(samples: tuple[Array, ...]) -> dict[tuple[int, int], Bool[Array, " m"]]:
     """Whether two samples see the same surface, for each pair (i, j) of the samples of a pixel with i < j."""
-    triangle, inverse, region, x, y, z, right, down, uneven = samples
+    triangle, inverse, region, x, y, z, right, down, uneven, facet = samples
     offset = SAMPLES[len(triangle)]
     same = {}
     for j in range(len(triangle)):
@@ -344,7 +347,8 @@ def _same(samples: tuple[Array, ...]) -> dict[tuple[int, int], Bool[Array, " m"]
             jump = jnp.abs(inverse[j] - inverse[i] - (step[0] + step[1]) / 2)
             near = jump <= (jnp.abs(step[0]) + jnp.abs(step[1])) / 2 + SAME_DEPTH * inverse[i]
             dot, *square = (x[a] * x[b] + y[a] * y[b] + z[a] * z[b] for a, b in ((i, j), (i, i), (j, j)))
-            alike = (dot >= 0) & (dot**2 >= SMOOTH**2 * square[0] * square[1])
+            least = jnp.where(facet[i] | facet[j], _PLANE, SMOOTH)
+            alike = (dot >= 0) & (dot**2 >= least**2 * square[0] * square[1])
             one = (triangle[i] == triangle[j]) | (near & alike & (region[i] == region[j]))
             same[i, j] = one & ~uneven[i] & ~uneven[j]
     return same
@@ -408,14 +412,17 @@ def _divided(
 ) -> tuple[Any, ...]:
     """Member masks without samples that become four points; and of each point its sample, triangle, column and row."""
     member, triangle = np.array(members), np.asarray(fragments.triangle).reshape(members.shape)
-    here = np.where(member > 0, detail[triangle], 0)
+    flat = (detail[triangle] == FACET) & (triangle >= 0) & np.asarray(facing)[triangle]
+    here = np.where(member > 0, detail[triangle] % FACET, 0)
     if share is not None:
-        here = np.where(np.all(np.asarray(share).reshape(*here.shape, -1) == 1, -1), here, 0)
-    pixel = np.flatnonzero(np.any(here > 1, 1))
+        whole = np.all(np.asarray(share).reshape(*here.shape, -1) == 1, -1)
+        here, flat = np.where(whole, here, 0), flat & whole
+    apart = np.all(flat, 1) & (np.count_nonzero(member, 1) > 1)
+    pixel = np.flatnonzero(np.any(here > 1, 1) | apart)
     if len(pixel) > len(here) // 2:  # what is kept of a view holds a kilobyte for each point
         pixel = pixel[(pixel // camera.width + pixel % camera.width) % 2 == 0]
     # All single samples of a pixel or none: their distances from the middles of their quarters cancel.
-    row, number = np.nonzero(here[pixel] > 0)
+    row, number = np.nonzero((here[pixel] > 0) | apart[pixel, None])
     sample = np.repeat((4 * pixel[row] + number).astype(np.int32), 4)
     chunks = [sample[first : first + _RAYS] for first in range(0, len(sample), _RAYS)]
     parts = [_places(chunk, triangle.ravel(), mesh, camera, np.asarray(facing), occluder) for chunk in chunks]

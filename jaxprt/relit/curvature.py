@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, UInt8
 from jaxprt.brdf import grid
 from jaxprt.compile import jit
 from jaxprt.image import raster
+from jaxprt.image.pixels import FACET
 from jaxprt.relit.channels import Shading
 from jaxprt.scene import Camera, Mesh
 from jaxprt.sphere import directions, hemisphere
@@ -25,6 +26,8 @@ _VIEW = np.array([0.6, 0.0, 0.8], np.float32)
 _WITHIN, _WITHIN_SAMPLES = 24 * 0.005, 24 * 0.16
 _RIM = 0.15  # allowed change of the cosine within a pixel, relative to the cosine plus this
 _MATTE = 0.83  # curvature up to which a surface counts as diffuse
+_FLAT = 1e-6  # squared difference of the normals of a flat triangle
+_FACETS = 40.0  # curvature from which on facets beside each other may be as different as light and dark
 _EDGE_ON = 1e-6  # smallest area of a projected triangle in square pixels
 
 
@@ -101,4 +104,6 @@ def detail(mesh: Mesh, camera: Camera, curvature: Float[Array, " v"]) -> UInt8[A
     mean = jnp.maximum((cosine[a] + cosine[b] + cosine[c]) / 3, 0)
     # Diffuse radiance does not depend on the view.
     rim = (square(cosine) > (_RIM * (mean + _RIM)) ** 2) & (curvature[a] > _MATTE)
-    return jnp.where(change > _WITHIN_SAMPLES, 2, (change > _WITHIN) | rim).astype(jnp.uint8)
+    within = jnp.where(change > _WITHIN_SAMPLES, 2, (change > _WITHIN) | rim)
+    bend = jnp.maximum(*(jnp.sum((mesh.normal[corner] - mesh.normal[a]) ** 2, -1) for corner in (b, c)))
+    return (within + FACET * ((bend < _FLAT) & (curvature[a] > _FACETS))).astype(jnp.uint8)

@@ -482,6 +482,30 @@ def test_samples_seen_through_hidden_backs_stay_one_point():
     np.testing.assert_array_equal(points.coverage[middle], [1 / 4] * 4)
 
 
+def test_facets_with_sharp_reflections_share_no_point_and_meet_in_sixteen():
+    """A ridge of two planes, five degrees apart, along the first quarter of a column of pixels."""
+    slope, edge = np.tan(np.radians(2.5)), 0.25 * 2 * np.tan(0.25) / 8
+    x = np.array([-9.0, edge, edge, 9.0])
+    position = np.stack([np.repeat(x, 2), np.tile([-9.0, 9.0], 4), np.repeat(-slope * np.abs(x - edge), 2)], 1)
+    normal = np.repeat([[-slope, 0, 1], [slope, 0, 1.0]], 4, 0)
+    face = np.array([[0, 2, 1], [1, 2, 3], [4, 6, 5], [5, 6, 7]])
+    mesh = Scene([Part("ridge", make_mesh(position, face, normal=normal), PLAIN)]).mesh
+    camera = Camera((0.0, 0, 1), (0.0, 0, 0), (0.0, 1, 0), 0.5, 16, 8)
+
+    def points(detail):
+        detail = jnp.full(len(mesh.face), detail, jnp.uint8)
+        found = visible_points(mesh, camera, samples=4, occluder=Occluder(mesh), detail=detail)
+        seen = np.asarray(found.triangle) >= 0
+        return np.asarray(found.pixel)[seen], np.asarray(found.triangle)[seen], np.asarray(found.coverage)[seen]
+
+    smooth, _, _ = points(0)
+    assert len(smooth) == 16 * 8
+    pixel, triangle, coverage = points(pixels.FACET)
+    ridge = pixel % 16 == 8
+    np.testing.assert_array_equal(np.bincount(pixel), np.where(np.arange(16 * 8) % 16 == 8, 16, 1))
+    np.testing.assert_allclose(coverage[ridge & (triangle < 2)].sum() / 8, 0.25, atol=0.07)
+
+
 def test_pictures_of_one_pixel_have_sixteen_points():
     mesh = Scene([Part("wall", sheet(0.0, (-9.0, 9.0)), PLAIN)]).mesh
     camera = Camera((0.0, 0, 0.1), (0.0, 0, 0), (0.0, 1, 0), 0.1, 1, 1)
