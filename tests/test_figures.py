@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks import relight_harmonic
+from benchmarks import accuracy, relight_harmonic
 from benchmarks.figures import __main__ as program
 from benchmarks.figures import drawing, pages, quoted, sun2007
 from jaxprt.scene import builtin
@@ -22,6 +22,12 @@ DOCS = pathlib.Path(__file__).parents[1] / "docs" / "figures"
 def test_tables_of_pages_are_those_of_the_measured_lines(page):
     text = page.read_text(encoding="utf-8")
     assert pages.filled(text, DOCS) == text
+
+
+def test_tables_of_errors_are_those_of_the_measured_lines():
+    measured = DOCS.parent / "measured"
+    lines = [json.loads(line) for line in (measured / "accuracy.jsonl").read_text(encoding="utf-8").splitlines()]
+    assert accuracy.tables(lines) in (measured / "accuracy.md").read_text(encoding="utf-8")
 
 
 def test_pictures_are_small_enough_and_named_by_a_page():
