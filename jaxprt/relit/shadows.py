@@ -239,7 +239,8 @@ def finer(light: Environment, *, size: int) -> Float[np.ndarray, "6 m m c"]:
         return np.asarray(light.radiance)
     known = _FINER.setdefault(panorama, {})
     if size not in known:
-        known[size] = np.asarray(environments.finer(light, size=size).radiance)
+        with compile_time():  # also while JAX traces the camera
+            known[size] = np.asarray(environments.finer(light, size=size).radiance)
     return known[size]
 
 

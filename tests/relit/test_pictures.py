@@ -152,6 +152,9 @@ def test_smooth_metals_show_light_that_is_finer_than_the_texels_of_their_scene()
     fine, coarse, right = colors[:3]
     assert np.linalg.norm(coarse - right) > 0.4 * np.linalg.norm(right)
     assert np.linalg.norm(fine - right) < 0.06 * np.linalg.norm(right)
+    traced = jax.jit(lambda eye: made.picture(known, dataclasses.replace(camera, eye=eye), samples=1, background=None))
+    one = np.asarray(made.picture(known, camera, samples=1, shadows="vertices", background=None))
+    np.testing.assert_allclose(traced(jnp.asarray(camera.eye)), one, atol=1e-4)
 
 
 def test_pictures_go_through_programs_and_have_gradients(close):
