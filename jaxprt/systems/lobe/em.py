@@ -16,8 +16,7 @@ from jaxprt.sphere import directions, hemisphere
 RINGS, SECTORS = 64, 96  # of the quadrature whose nodes are the samples of EM
 FINEST = 2e5  # largest concentration, a width of an eighth of a degree
 _WIDEST = 2.0  # smallest concentration relative to a single lobe's; wider lobes would average light and shadow
-_TAIL = 4  # One of this many lobes may be wider, to fit the BRDF's tails;
-_RATIO = 4.0  # each has this factor less concentration than the one before it,
+_TAIL = 2  # One of this many lobes may be wider, each by the same factor, to fit the BRDF's tails,
 _BROADEST = 8.0  # down to this concentration, a width of twenty degrees
 _SHARP = 50.0  # concentration above which a lobe counts as a planar normal distribution
 _CORE = 0.6  # share of the mass, nearest to the mirror direction, that sets the initial spread of lobes
@@ -62,7 +61,7 @@ def start(
 ) -> tuple[mixture.Mixture, Float[Array, "v l"]]:
     """Initial lobes for EM, on a spiral over half vectors that covers the BRDF's core; and their concentration bounds.
 
-    The last quarter of the lobes have smaller bounds, so that they can widen to fit the tails of a sharp BRDF. Without
+    The last half of the lobes have smaller bounds, so that they can widen to fit the tails of a sharp BRDF. Without
     them EM would assign the tails to the diffuse part.
 
     Args:
@@ -88,11 +87,27 @@ def start(
     drop = 2 * jnp.sum(near * away, 1)
     least = jnp.clip(_WIDEST * mixture.concentration_of(jnp.clip(drop, 1e-7, 0.8)), 1, FINEST / 2)
     mean = _reflect(wo, tilt, _LOWEST)
-    wider = _RATIO ** -jnp.maximum(number + 1 - (lobes - lobes // _TAIL), 0)
-    least = jnp.minimum(least[:, None], jnp.maximum(least[:, None] * wider, _BROADEST))
+    wider = jnp.maximum(number + 1 - (lobes - lobes // _TAIL), 0) / max(lobes // _TAIL, 1)
+    least = least[:, None] * (_BROADEST / jnp.maximum(least[:, None], _BROADEST)) ** wider
     concentration = 1.5 * least
     weight = jnp.broadcast_to(portion[:, -1:] / lobes, mean.shape[:2])
     return mixture.Mixture(weight, mean, concentration), least
+
+
+@jit
+def most_diffuse(
+    mass: Float[Array, "v s c"], fixed: Float[Array, "v s 1"], extent: Float[Array, "v s"]
+) -> Float[Array, "v c"]:
+    """Upper bound of the diffuse albedo: that of the BRDF's median over directions of light, weighted by cosine.
+
+    Without it, the tails of a sharp BRDF would become diffuse. Arguments are those that `samples` returns.
+    """
+    measure = np.pi * jnp.exp(fixed) * 4 * np.pi * extent[..., None]
+    value = jnp.where(measure > 0, mass / jnp.where(measure > 0, measure, 1), 0)
+    order = jnp.argsort(value, 1)
+    portion = jnp.cumsum(jnp.take_along_axis(jnp.broadcast_to(measure, value.shape), order, 1), 1)
+    middle = jnp.argmax(portion >= portion[:, -1:] / 2, 1)[:, None]
+    return np.pi * jnp.take_along_axis(value, jnp.take_along_axis(order, middle, 1), 1)[:, 0]
 
 
 @partial(jit, static_argnames=("steps",))
@@ -188,11 +203,12 @@ def weigh(
     lobe: mixture.Mixture,
     fixed: Float[Array, "v s k"],
     weight: Float[Array, "v k"],
+    most: Float[Array, "v c"],
 ) -> Float[Array, "c m v"]:
     """Weights of the lobes and, last, of the diffuse part per color, scaled to the BRDF's energy above the horizon."""
 
     def one(argument):
-        sample, mass, extent, lobe, fixed, weight = argument
+        sample, mass, extent, lobe, fixed, weight, most = argument
         density = mixture.log_density(sample, lobe.mean, lobe.concentration)
         # Part of each lobe above the horizon. For a sharp lobe it is that of a normal distribution cut by a plane.
         wide = jnp.minimum(jnp.sum(jnp.exp(density) * 4 * np.pi * extent[:, None], 0), 1)
@@ -201,9 +217,11 @@ def weigh(
         start = jnp.concatenate([lobe.weight, weight])
         start, density = start + 1e-3 * jnp.mean(start), jnp.concatenate([density, fixed], 1)
         weight = jax.vmap(lambda m: mixture.weigh(density, m, start, steps=30)[0], in_axes=1)(mass)
-        return weight * (jnp.sum(weight, 1) / jnp.maximum(weight @ above, _TINY))[:, None]
+        lobes, diffuse = weight[:, :-1], jnp.minimum(weight[:, -1], most)
+        scale = (jnp.sum(weight, 1) - diffuse) / jnp.maximum(lobes @ above[:-1], _TINY)
+        return jnp.concatenate([lobes * scale[:, None], diffuse[:, None]], 1)
 
-    return jnp.moveaxis(jax.lax.map(one, (sample, mass, extent, lobe, fixed, weight)), 0, -1)
+    return jnp.moveaxis(jax.lax.map(one, (sample, mass, extent, lobe, fixed, weight, most)), 0, -1)
 
 
 def mirror(wo: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:

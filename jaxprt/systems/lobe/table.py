@@ -209,9 +209,10 @@ def tabulate(
     At each view node, EM fits lobes to samples on arcs around the mirror direction. All nodes start with the same
     arrangement of lobes in terms of half vectors. Between rounds of EM each node is averaged with its neighbors, so
     that corresponding lobes of adjacent nodes can be interpolated; neighbors along a BRDF parameter are averaged too,
-    relative to the width of their lobes. Three quarters of the lobes are at most about 0.7
+    relative to the width of their lobes. Half of the lobes are at most about 0.7
     times as wide as a single lobe would be, so that they resolve light and visibility that vary over the BRDF's lobe.
-    The others may be wider, to fit the tails of sharp BRDFs. The reflected energy of each node is preserved. The last
+    The others may be wider, to fit the tails of sharp BRDFs. The diffuse part is at most as bright as the BRDF's median
+    over directions of light. The reflected energy of each node is preserved. The last
     node of an isotropic table is half a degree above the horizon and used as if it were on it.
 
     Args:
@@ -305,6 +306,7 @@ def _tables(samples: list[tuple[Array, ...]], wo: Array, size: tuple[int, ...], 
     nodes, view = wo.shape[:-1], np.asarray(wo).reshape(-1, 3)
     state = [_begin(view, sample, mass, lobes=lobes) for sample, mass, _, _ in samples]
     lobe, weight = [knot[1] for knot in state], [knot[3] for knot in state]
+    most = [em.most_diffuse(*sample[1:]) for sample in samples]
     # EM runs for one BRDF at a time; smoothing is along the parameters too, which have `size` knots.
     for times, smoothing in _ROUNDS:
         for number, (sample, _, fixed, extent) in enumerate(samples):
@@ -313,11 +315,12 @@ def _tables(samples: list[tuple[Array, ...]], wo: Array, size: tuple[int, ...], 
                 lobe[number], weight[number] = em.improve(
                     sample, gray, extent, lobe[number], least, fixed, weight[number], steps=_STEPS
                 )
+                weight[number] = jnp.minimum(weight[number], jnp.sum(most[number], 1, keepdims=True))
         if smoothing:
             lobe = _smooth(view, lobe, jnp.asarray(smoothing, wo.dtype), size, nodes)
     return [
-        _end(one, em.weigh(sample, mass, extent, one, fixed, base), nodes=nodes)
-        for one, base, (sample, mass, fixed, extent) in zip(lobe, weight, samples, strict=True)
+        _end(one, em.weigh(sample, mass, extent, one, fixed, base, bound), nodes=nodes)
+        for one, base, bound, (sample, mass, fixed, extent) in zip(lobe, weight, most, samples, strict=True)
     ]
 
 
