@@ -75,6 +75,22 @@ class Caster:
         triangle[ray, point], barycentric[ray, point] = np.where(itself, -3 if at_vertices else -2, hit), weight
         return triangle, barycentric, start
 
+    def blocked(self, rays: ReflectionRays, points: Points) -> Int[np.ndarray, "j v"]:
+        """-1 for each ray that hits no triangle or is not cast, -2 for others.
+
+        Args:
+            rays: Rays that start from points.
+            points: The points of the scene.
+        """
+        way, chance = np.asarray(rays.direction, np.float32), np.asarray(rays.chance)
+        ray, point = np.nonzero(chance > 0)
+        result = np.full(chance.shape, -1)
+        # Rays of one number and of neighboring points are alike.
+        direction, number = np.ascontiguousarray(way[ray, point]), np.arange(len(point))
+        start = point_starts(self.mesh, points)
+        result[ray, point] -= self.occluder.blocked(start, direction, point, number)
+        return result
+
     def spread(
         self,
         rays: ReflectionRays,

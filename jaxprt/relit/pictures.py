@@ -469,25 +469,32 @@ def make(
         pixels, rows = _placed(stage, camera, samples, between)
     rays = isinstance(shadow, Environment) or shadow == "rays"
     lit = lamplight.of(stage, pixels, camera.width) if rays else None
-    complete, places, origins, sharp = [], [], [], stage.sharp_groups
+    eye, sharp = jnp.asarray(camera.eye), stage.sharp_groups
+    complete, places, origins, narrow = [], [], [], []
     for row in rows:
         index = row.index if row.index.ndim == 1 else row.index[0]
         stores = keep and not isinstance(index, Tracer)
-        if not stores and row.group not in sharp:
+        casts = row.group in sharp or (rays and stage.rays > 0 and stage.finer(row.group) and known(index))
+        if not stores and not casts:
             places.append(None)
             continue
         points, on_group = canvas.points_of(stage, pixels, index)
         transport = None if lit is None else lit.row(row.group, index, on_group)
         places.append((points, on_group, transport) if stores else None)
-        if row.group in sharp:
+        if casts:
             blend, tilted = stage.blend(row.group, points, on_group)
-            narrow, turn = stage.sharp_at(row.group, points), _turn(pixels, index)
-            origins.append(tracing.RayOrigins(row.group, points, tilted, blend, narrow, transport, turn))
-    reflected = tracing.trace(stage, origins, jnp.asarray(camera.eye), keep=keep) if origins else None
+            share, turn = stage.sharp_at(row.group, points), _turn(pixels, index)
+            origin = tracing.RayOrigins(row.group, points, tilted, blend, share, transport, turn)
+            (origins if row.group in sharp else narrow).append(origin)
+    reflected = tracing.trace(stage, origins, eye, keep=keep) if origins else None
     paths = iter(() if reflected is None else reflected.paths)
+    missed = iter(tracing.missed_shares(stage, narrow, eye) if narrow else ())
+    alone = {origin.group for origin in narrow}
     for row, place in zip(rows, places, strict=True):
         if row.group in sharp:
             row = dataclasses.replace(row, missed=next(paths).missed)
+        elif row.group in alone:
+            row = dataclasses.replace(row, missed=next(missed))
         if place is not None:
             points, on_group, transport = place
             row = dataclasses.replace(row, viewed=_seen(stage, row, points, on_group, camera, lamps=transport))

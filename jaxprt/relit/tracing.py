@@ -13,6 +13,7 @@ roughness raise an error.
 
 import dataclasses
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import reduce
 from typing import Any
 
@@ -30,12 +31,13 @@ from jaxprt.relit.groups import Arriving, Stage, Surface, surface_of
 from jaxprt.relit.surface import Viewed, radiance, view
 from jaxprt.scene import Mesh
 from jaxprt.scene.points import Points
-from jaxprt.systems.bounces import ReflectingPart
+from jaxprt.systems.bounces import ReflectingPart, traced
 from jaxprt.systems.bounces.traced import ReflectionRays
 from jaxprt.systems.lamps import LampTransport
 from jaxprt.systems.lamps.relight import ray_share
 from jaxprt.systems.lobe.table import traced_visibility
 from jaxprt.systems.protocol import Blend
+from jaxprt.visibility import blocks
 
 _MOST_RAYS = 1 << 12  # of each vertex or point
 
@@ -154,10 +156,9 @@ def trace(stage: Stage, origins: Sequence[RayOrigins], eye: Float[Array, "3"], *
         with jax.ensure_compile_time_eval():
             bundle = _reflecting(stage, origin).rays(eye, origin.parameter, origin.on_group, origin.share)
             bundle = bundle if origin.turn is None else _shared(bundle, origin.turn)
-            narrow = traced_visibility(bundle.concentration) * (bundle.chance > 0)
             hit = cast.cast(bundle, origin.points, at_vertices=origin.on_group.all_vertices)
             hits.append((*hit, cast.spread(bundle, *hit)))
-            rays.append((bundle, _missed(np.asarray(narrow), hit[0])))
+            rays.append((bundle, _missed(bundle, hit[0])))
     slots, rows = _rows(stage, cast, hits, keep=keep)
     paths = []
     for origin, (bundle, missed), slot, (triangle, *_) in zip(origins, rays, slots, hits, strict=True):
@@ -175,8 +176,40 @@ def _shared(rays: ReflectionRays, turn: Int[np.ndarray, " v"]) -> ReflectionRays
     return dataclasses.replace(rays, chance=put(np.where(other, 0, np.asarray(rays.chance))))
 
 
-def _missed(narrow: Float[np.ndarray, "j v"], triangle: Int[np.ndarray, "j v"]) -> Float[Array, " v"]:
+def missed_shares(
+    stage: Stage, origins: Sequence[RayOrigins], eye: Float[Array, "3"]
+) -> list[Float[Array, " v"] | None]:
+    """Share of the rays of very narrow lobes that hit nothing, for points of groups that reflect no other surfaces.
+
+    The rays are those of direct light. Each result is as in `PathWeights`; None for what is traced by JAX.
+    """
+
+    def rays_of(origin: RayOrigins) -> tuple[RayOrigins, ReflectionRays] | None:
+        surface = stage.surfaces[origin.group]
+        system = surface.system.lobe_part
+        if system is None or not known(origin.points, origin.on_group, origin.parameter, system.brdf, eye):
+            return None
+        with jax.ensure_compile_time_eval():
+            place = surface.position, surface.frame, origin.on_group
+            return origin, traced.very_narrow(system.brdf, *place, eye, origin.parameter, count=stage.rays)
+
+    def missed(pair: tuple[RayOrigins, ReflectionRays] | None) -> Float[Array, " v"] | None:
+        if pair is None:
+            return None
+        origin, rays = pair
+        rays = rays if origin.turn is None else _shared(rays, origin.turn)
+        return _missed(rays, cast.blocked(rays, origin.points))
+
+    if not known(stage.whole):
+        return [None] * len(origins)
+    cast = caster(stage.whole)
+    with ThreadPoolExecutor(blocks.cores()) as pool:
+        return list(pool.map(missed, [rays_of(origin) for origin in origins]))
+
+
+def _missed(rays: ReflectionRays, triangle: Int[np.ndarray, "j v"]) -> Float[Array, " v"]:
     """Share of the rays of narrow lobes that hit nothing, at each vertex or point; -1 where there are none."""
+    narrow = np.asarray(traced_visibility(rays.concentration) * (rays.chance > 0))
     # Rays that hit a triangle around their own vertex do not tell what is behind it.
     total, free = ((narrow * counts).sum(0) for counts in (triangle > -3, triangle == -1))
     return put(np.where(total > 0, free / np.where(total > 0, total, 1), -1).astype(narrow.dtype))

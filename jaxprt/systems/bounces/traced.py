@@ -9,6 +9,7 @@ The rays of a point are quantiles of the mixture of its narrow lobes. Their dire
 widths of the lobes, but not on colors. Their weights depend on colors too, and are differentiable in them.
 """
 
+import dataclasses
 import math
 from functools import partial, reduce
 
@@ -20,10 +21,11 @@ from numpy.typing import ArrayLike
 
 from jaxprt.compile import jit
 from jaxprt.decompose import mixture
+from jaxprt.scene.points import Points, placed
 from jaxprt.sphere import directions, harmonics
 from jaxprt.systems.bounces.jobs import DEGREE
 from jaxprt.systems.lobe import LobeBrdf
-from jaxprt.systems.lobe.table import LobeMixture, traced_share
+from jaxprt.systems.lobe.table import LobeMixture, traced_share, traced_visibility
 from jaxprt.systems.protocol import Blend
 
 FEW = 0.55  # traced fraction of what a BRDF's lobes reflect, below which rays bring nothing
@@ -153,6 +155,23 @@ def quantiles(
     local = _around([of_lobe(axis) for axis in lobes.mean], drop, angle)
     world = [reduce(jnp.add, (local[i] * frame[:, i, j] for i in range(3))) for j in range(3)]
     return ReflectionRays(jnp.stack(world, -1), number.astype(jnp.int32), share, concentration)
+
+
+@partial(jit, static_argnames="count")
+def very_narrow(
+    table: LobeBrdf,
+    position: Float[Array, "v 3"],
+    frame: Float[Array, "v 3 3"],
+    points: Points,
+    eye: Float[Array, "3"],
+    parameter: tuple[Float[Array, " p"], ...],
+    *,
+    count: int,
+) -> ReflectionRays:
+    """The rays of points between vertices whose visibility counts for very narrow lobes."""
+    position, frame = placed(position, frame, points)
+    rays = quantiles(lookup(table, position, frame, eye, parameter), None, position, frame, count=count)
+    return dataclasses.replace(rays, chance=jnp.where(traced_visibility(rays.concentration) > 0, rays.chance, 0))
 
 
 @jit
