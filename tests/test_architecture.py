@@ -34,7 +34,7 @@ LADDER = [
     {"harmonic"},
     {"reference", "bright_texels", "devices"},
 ]
-LADDER += [{"adaptive", "protocol"}, {"axes"}]
+LADDER += [{"light_cells"}, {"adaptive", "protocol"}, {"axes"}]
 RUNG = {system: number for number, rung in enumerate(LADDER) for system in rung}
 
 # Libraries that only some modules touch: everything that reads files, and the rays.

@@ -53,7 +53,8 @@ JITTED = type(jax.jit(lambda: 0))
 REASONS = {
     "checks values, or chooses by them": """
         require scene.points.on_triangles benchmarks.published.factorization benchmarks.published.lobes.mirror_lobes
-        require.finite require.length systems.harmonic.transfer.check systems.harmonic.transfer.check_memory
+        require.finite require.length systems.light_cells.counts systems.harmonic.transfer.check
+        systems.harmonic.transfer.check_memory
         brdf.measured.require brdf.measured.check_unique brdf.measured.one_of brdf.models.color brdf.models.scalar
         systems.harmonic.table.tabulate systems.separable.factorization.check_mark
         systems.separable.factorization.factor systems.lobe.table.tabulate systems.lobe.table.brdf_samples
@@ -135,7 +136,7 @@ REASONS = {
     "views and sums of systems; tests/systems/lobe/test_widened.py": "systems.lobe.widened",
     "a step of ReflectingPart; tests/systems/bounces/test_traced.py": """
         systems.bounces.traced.lookup systems.bounces.traced.harmonics_of systems.bounces.traced.quantiles
-        systems.bounces.traced.weights
+        systems.bounces.traced.weights systems.bounces.traced.very_narrow
     """,
     "reads files, on the host; the rest fits what is in them": "systems.standard",
     "integrates cells that a loop chooses; reference.integrate has them all": "systems.adaptive",
@@ -605,7 +606,7 @@ EXAMPLES = {
         )
     ),
     "systems.bright_texels.split": example(lambda draw: call(draw.light()), count=5),
-    "systems.bright_texels.split_cells": example(lambda draw: call(draw.light(16))),
+    "systems.light_cells.split": example(lambda draw: call(draw.light(16))),
     "systems.bright_texels.brightest": example(
         lambda draw: call(draw.light(), least=draw.array(0.0)), count=5, rank=9, gradient=()
     ),

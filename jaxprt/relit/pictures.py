@@ -482,9 +482,7 @@ def make(
         transport = None if lit is None else lit.row(row.group, index, on_group)
         places.append((points, on_group, transport) if stores else None)
         if casts:
-            blend, tilted = stage.blend(row.group, points, on_group)
-            share, turn = stage.sharp_at(row.group, points), _turn(pixels, index)
-            origin = tracing.RayOrigins(row.group, points, tilted, blend, share, transport, turn)
+            origin = _origins(stage, row.group, (points, on_group, transport), _turn(pixels, index))
             (origins if row.group in sharp else narrow).append(origin)
     reflected = tracing.trace(stage, origins, eye, keep=keep) if origins else None
     paths = iter(() if reflected is None else reflected.paths)
@@ -496,8 +494,7 @@ def make(
         elif row.group in alone:
             row = dataclasses.replace(row, missed=next(missed))
         if place is not None:
-            points, on_group, transport = place
-            row = dataclasses.replace(row, viewed=_seen(stage, row, points, on_group, camera, lamps=transport))
+            row = dataclasses.replace(row, viewed=_seen(stage, row, place[0], place[1], camera, lamps=place[2]))
         complete.append(row)
     ray = raster.ray_direction(camera)
     shares, way = None, "vertices"
@@ -511,6 +508,18 @@ def make(
     more |= {"light_size": scene.light_size, "light_step": scene.light_step}
     arriving = eqx.Partial(scene.arriving, stage)
     return PictureView(stage, arriving, camera, pixels, ray, tuple(complete), reflected, fold, way, keep, **more)
+
+
+def _origins(
+    stage: Stage,
+    group: int,
+    place: tuple[Points, Points, LampTransport | None],
+    turn: Int[np.ndarray, " p"] | None,
+) -> tracing.RayOrigins:
+    """Points of a group from which reflection rays start."""
+    points, on_group, transport = place
+    blend, tilted = stage.blend(group, points, on_group)
+    return tracing.RayOrigins(group, points, tilted, blend, stage.sharp_at(group, points), transport, turn)
 
 
 def _turn(pixels: Pixels, index: Any) -> Int[np.ndarray, " p"] | None:

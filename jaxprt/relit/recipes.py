@@ -13,7 +13,7 @@ import numpy as np
 from jaxprt import require, visibility
 from jaxprt.relit.channels import Shading
 from jaxprt.scene import Mesh
-from jaxprt.systems import axes, bright_texels, dynamic, harmonic, lobe, separable, standard
+from jaxprt.systems import axes, bright_texels, dynamic, harmonic, light_cells, lobe, separable, standard
 from jaxprt.systems.lobe import LobeTransport, diffuse, pyramid
 from jaxprt.systems.protocol import System
 from jaxprt.systems.separable import SeparableBrdf
@@ -23,7 +23,6 @@ from jaxprt.visibility import Run, StoredVisibility
 _HARMONIC_SIZE = 32  # edge of the visibility's faces in texels: enough for low degrees
 _STEPS = 4  # number of intervals of a harmonic table for each interval of a lobe table
 _VARYING = 0.02  # error of harmonic tables over roughness
-_MATTE_TEXELS = 32  # factor on the number of single texels of Lambertian parts
 _WIDE = 2  # most places along the edge of a bright texel for the roughest material that has cells
 _PAIRS = 256  # pairs of directions at which BRDFs are tried
 _HALF = {"normal_texture": "turn highlights by half of its angle, and diffuse light not at all"}
@@ -159,7 +158,7 @@ class Lobes(Recipe):
         transport = axes.pad(_pyramid(shading.mesh, target), vertices)
         if shading.matte:
             matte = lobe.MatteSystem(lobe.matte_transport(transport), shading.albedo)
-            return _bright(matte, lobe.texel_bits(transport), shading, _MATTE_TEXELS * self.texels, transport.size)
+            return _bright(matte, lobe.texel_bits(transport), shading, self.texels, transport.size, cells=True)
         table = lobe_table(shading, self.lobes)
         system = lobe.LobeSystem(transport, table)
         return _bright(system, transport, shading, self.texels, transport.size, cells=True)
@@ -429,7 +428,7 @@ def _bright(system: System, visible: Any, shading: Shading, texels: int, size: i
     texels = min(texels, 6 * size * size - 1)
     if not texels:
         return system
-    samples, cells = samples_of(shading, size), cells and size > bright_texels.WIDEST
+    samples, cells = samples_of(shading, size), cells and size > light_cells.WIDEST
     by_lobes = cells and samples > 1  # Lobes narrower than cells read light and visibility within them.
     if by_lobes and not (isinstance(system, lobe.LobeSystem) and samples_of(shading, size, roughest=True) <= _WIDE):
         cells = by_lobes = False

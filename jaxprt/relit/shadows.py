@@ -132,6 +132,7 @@ class CellLight(NamedTuple):
         chosen: Indices of those that bring light.
         seen: Their visible shares at the vertices of the group, in 240ths.
         rays: Rays to even places in them.
+        strong: Indices of those whose shares `row` returns; None for all.
     """
 
     stage: Stage
@@ -141,6 +142,7 @@ class CellLight(NamedTuple):
     chosen: Int[np.ndarray, " n"]
     seen: UInt8[np.ndarray, "v n"]
     rays: picture_rays.TexelRays
+    strong: Int[np.ndarray, " s"] | None
 
     def row(self, index: Int[np.ndarray, " p"]) -> UInt8[Array, "t p"]:
         """Visible shares at some points of the group, in 240ths, by rays where the corners of a triangle differ.
@@ -153,12 +155,14 @@ class CellLight(NamedTuple):
         stored = self.seen, corner - np.asarray(self.stage.shift)[corner]
         share = np.zeros((self.number, len(index)), np.uint8)
         share[self.chosen] = picture_rays.shares(cast.triangles, cast.occluder, points, self.rays, stored=stored)
-        return put(share)
+        return put(share if self.strong is None else share[self.strong])
 
 
 def _rays_to(light: BrightLight, squares: Sequence[Squares]) -> tuple[np.ndarray, picture_rays.TexelRays]:
     """Which texels and cells bring light, and rays to even places in them, more to those with more flux."""
     texel, excess = np.asarray(light.texel), np.asarray(light.excess, np.float64).sum(1)
+    if light.strong is not None:
+        excess = np.where(np.isin(np.arange(len(texel)), light.strong), excess, 0)
     used, direction, flux, first = [], [], [], 0
     for edge, count, _ in squares:
         here = first + np.flatnonzero(excess[first : first + count])
@@ -199,7 +203,8 @@ def cells(stage: Stage, pixels: Pixels, width: int, direct: Sequence[Any]) -> It
         else:
             chosen, rays = _rays_to(light, system.squares)
             seen = np.ascontiguousarray(np.asarray(light.seen)[chosen].T)
-            yield CellLight(stage, pixels, width, len(light.texel), chosen, seen, rays)
+            strong = None if light.strong is None else np.asarray(light.strong)
+            yield CellLight(stage, pixels, width, len(light.texel), chosen, seen, rays, strong)
 
 
 def untraced(environment: Environment) -> Environment:

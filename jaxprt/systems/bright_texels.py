@@ -29,17 +29,13 @@ from jaxprt.compile import TOGETHER, jit, mapped, total
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import VERTICES, Points, placed
 from jaxprt.sphere import cubemap, directions
-from jaxprt.systems import adaptive, protocol
+from jaxprt.systems import adaptive, light_cells, protocol
 from jaxprt.systems.protocol import Blend, System, VertexSystem
 from jaxprt.visibility.picture_rays import FULL
 
 _ROW = 32  # texels per row, of which only the brightest is sorted at first
-# Numbers of cells that are taken out together, by the edge of a face in cells. The light chooses one of them.
-_PLANS = {32: 64, 8: 32}, {16: 64, 8: 64}, {8: 64}
-_JUMP, _WITHIN = 16, 0.1  # edge of the means whose steps lobes cannot follow, and what steps within them count
-_WIDE = 4  # edge of the means about which steps are counted
-WIDEST = 8  # edge of a face in the largest cells
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
+_STRONG = 32  # texels and cells of which points of pictures on ideally diffuse surfaces know what they see
 _TOGETHER = 32  # texels whose visibility is read at once
 _value = jit(adaptive.value)
 
@@ -84,11 +80,12 @@ class BrightLight(eqx.Module):
         rest: The rest of the light, in the form of the underlying system.
         texel: Indices of the brightest texels, and then of cells from level to level.
         excess: Radiance taken out of each of these texels and cells.
-        seen: Visible share of each of them for every vertex, in 240ths; None before `BrightTexels.shade`, and for
-            ideally diffuse surfaces.
+        seen: Visible share of each of them for every vertex, in 240ths; None before `BrightTexels.shade`.
         flux: Vector irradiance / pi of every vertex by all of these texels, and then its irradiance / pi, for ideally
             diffuse surfaces; None before `BrightTexels.shade`, and for others.
-        here: Visible shares at the points of one view, in 240ths, in place of `seen`; None to interpolate that.
+        here: Visible shares at the points of one view, in 240ths, in place of `seen`; None to interpolate that. For
+            ideally diffuse surfaces they are those of `strong` alone.
+        strong: Indices of the texels and cells with the most flux, for ideally diffuse surfaces; None for others.
     """
 
     rest: PyTree
@@ -96,7 +93,8 @@ class BrightLight(eqx.Module):
     excess: Float[Array, "t c"]
     seen: UInt8[Array, "t v"] | None = None
     flux: Float[Array, "c 4 v"] | None = None
-    here: UInt8[Array, "t p"] | None = None
+    here: UInt8[Array, "_ p"] | None = None
+    strong: Int[Array, " s"] | None = None
 
 
 class BrightView(eqx.Module):
@@ -156,13 +154,23 @@ class BrightTexels(VertexSystem):
         environment = protocol.light_for(self, environment)
         texel, excess, rest = split(environment, count=self.count)
         if self.cells:
-            cell, taken, even = split_cells(rest)
+            cell, taken, even = light_cells.split(rest)
             texel, excess = jnp.concatenate([texel, cell]), jnp.concatenate([excess, taken])
             if self.by_lobes:
                 lobes: Any = self.system
                 return BrightLight(lobes.two_lights(rest, even), texel, excess)
             rest = even
-        return BrightLight(self.system.light(rest), texel, excess)
+        strong = _strongest(texel, excess, numbers=self._numbers) if self.cells and self._diffuse_alone else None
+        return BrightLight(self.system.light(rest), texel, excess, strong=strong)
+
+    @property
+    def _diffuse_alone(self) -> bool:
+        return self.matte and getattr(self.brdf, "matte", False)
+
+    @property
+    def _numbers(self) -> tuple[tuple[int, int], ...]:
+        """Edge of a face in texels or cells, and number of them, in the order of `BrightLight`."""
+        return tuple((edge, number) for edge, number, _ in self.squares)
 
     @property
     def squares(self) -> tuple["Squares", ...]:
@@ -174,8 +182,10 @@ class BrightTexels(VertexSystem):
         # Wide lobes need the middle of a cell alone. Materials that become smoother need more places in wide cells.
         samples = 1 if self.by_lobes else samples
         wide = samples if samples == 1 else 2 * samples
-        counts = _cell_counts(size).items()
-        return texels, *(Squares(edge, count, wide if edge == WIDEST else samples) for edge, count in counts)
+        counts = light_cells.counts(size).items()
+        return texels, *(
+            Squares(edge, count, wide if edge == light_cells.WIDEST else samples) for edge, count in counts
+        )
 
     @property
     def parts(self) -> tuple[slice, slice]:
@@ -188,12 +198,13 @@ class BrightTexels(VertexSystem):
 
     def _seen(self, light: BrightLight) -> BrightLight:
         """The light with what vertices see of the bright texels."""
-        if light.seen is not None or light.flux is not None:
+        if light.seen is not None:
             return light
-        if self.matte and getattr(self.brdf, "matte", False):
-            return dataclasses.replace(light, flux=_vector_flux(self.visibility, light.texel, light.excess))
-        numbers = tuple((edge, number) for edge, number, _ in self.squares)
-        return dataclasses.replace(light, seen=_shares(self.visibility, light.texel, light.excess, numbers))
+        seen, flux = _shares(self.visibility, light.texel, light.excess, self._numbers), None
+        if self._diffuse_alone:
+            normal = self.visibility.frame[:, 2].T
+            flux = _vector_flux(normal, light.texel, light.excess, seen, numbers=self._numbers)
+        return dataclasses.replace(light, seen=seen, flux=flux)
 
     def tilted(self, light: BrightLight, normal: Float[Array, "v 3"]) -> BrightLight:
         """The light, whose rest is that of the underlying system: `System.tilted`."""
@@ -218,7 +229,8 @@ class BrightTexels(VertexSystem):
         require.kind("the view", view, BrightView, source="BrightTexels.view")
         light, rest = self._seen(light), self.system.combine(light.rest, view.rest, points)
         if light.flux is not None:
-            return rest + self._diffuse(light.flux, view, points).T * self.system.diffuse_albedo(view.rest)
+            sent = self._diffuse(light.flux, view, points) if light.here is None else self._traced(light, view, points)
+            return rest + sent.T * self.system.diffuse_albedo(view.rest)
         shares: Any = light.seen if light.here is None else light.here
         points = points if light.here is None else VERTICES
         texels, squares = (light.texel, light.excess / FULL, shares), self.squares
@@ -243,6 +255,14 @@ class BrightTexels(VertexSystem):
         # Between vertices a sun's vector stays as it is, that of light from everywhere turns with the normal. F is too
         # short for the second kind, and E too dark for the first.
         return jnp.maximum(tilted + jnp.maximum(flux[:, 3] - upright, 0), 0)
+
+    def _traced(self, light: BrightLight, view: BrightView, points: Points) -> Float[Array, "c p"]:
+        """Irradiance / pi by the bright texels, of which points know what they see of the strong ones."""
+        seen, here = jnp.asarray(light.seen, view.frame.dtype), jnp.asarray(light.here, view.frame.dtype)
+        share = points.carry(seen, axis=1).at[light.strong].set(here)
+        area = _areas(light.texel, self._numbers).astype(share.dtype)
+        cosine = jnp.maximum(_component(view.frame[:, 2].T, area[:, None]), 0)
+        return jnp.einsum("tc,tp->cp", light.excess / (np.pi * FULL), share * cosine, precision="highest")
 
     def diffuse_albedo(self, view: BrightView) -> Float[Array, "v c"]:
         """The albedo of the underlying system."""
@@ -291,7 +311,7 @@ class BrightTexels(VertexSystem):
     def shared_light(self) -> tuple | None:
         """Key of the light: that of the underlying system, with the number of texels and the kind of cells."""
         rest = self.system.shared_light
-        return rest and (BrightTexels, self.count, self.cells, self.by_lobes, rest)
+        return rest and (BrightTexels, self.count, self.cells, self.by_lobes, self._diffuse_alone, rest)
 
 
 class Squares(NamedTuple):
@@ -306,97 +326,6 @@ class Squares(NamedTuple):
     edge: int
     number: int
     samples: int
-
-
-def _plans(size: int) -> list[dict[int, int]]:
-    """The numbers of cells that can be taken out of a light: all cells are larger than its texels."""
-    return [plan for plan in _PLANS if max(plan) < size]
-
-
-def _cell_counts(size: int) -> dict[int, int]:
-    """Most cells that a plan takes out, by the edge of a face in cells, from fine to coarse."""
-    most: dict[int, int] = {}
-    for plan in _plans(size):
-        most |= {edge: max(count, most.get(edge, 0)) for edge, count in plan.items()}
-    return dict(sorted(most.items(), reverse=True))
-
-
-@require.arguments(light=protocol.one_light)
-@jit
-def split_cells(light: Environment) -> tuple[Int[Array, " t"], Float[Array, "t c"], Environment]:
-    """Takes radiance out of cells of a light: squares of texels, 6 x 32 x 32, 6 x 16 x 16 and 6 x 8 x 8 of them.
-
-    From fine to coarse, the cells with the most flux lose what exceeds the next one. The light chooses how many of each
-    size: those that leave it the most even. Derivatives are those of the chosen cells.
-
-    Args:
-        light: One environment, whose faces have an edge of a power of two texels. Cells are larger than texels.
-
-    Returns:
-        Indices of cells, size after size; the radiance taken out of each, 0 for cells that are not used; and the rest
-        of the environment, which may be negative in parts of a cell.
-
-    Raises:
-        TypeError: The light is not an `Environment`.
-        ValueError: The light is a batch, or the edge of its faces is not a power of two.
-    """
-    if (size := light.radiance.shape[-2]) & (size - 1):
-        raise ValueError(f"the light must have faces of a power of two texels along an edge, got {size}")
-    colors, counts = light.radiance.shape[-1], _cell_counts(size)
-    if not counts:
-        return jnp.zeros(0, jnp.int32), jnp.zeros((0, colors), light.radiance.dtype), light
-    area, results, steps = cubemap.solid_angle(size=size)[..., None], [], []
-    largest = jnp.maximum(jnp.max(light.radiance), jnp.finfo(light.radiance.dtype).tiny)  # squares would overflow
-    for plan in _plans(size):
-        rest, cells, taken = light.radiance, [], []
-        for edge, most in counts.items():
-            count = plan.get(edge, 0)
-            cell, excess = _largest_cells(rest, area, edge, count)
-            full = jnp.zeros((6 * edge**2, colors), rest.dtype).at[cell].set(excess)
-            rest = rest - _repeated(full.reshape(6, edge, edge, colors), size)
-            cells.append(jnp.pad(cell, (0, most - count)))
-            taken.append(jnp.pad(excess, ((0, most - count), (0, 0))))
-        results.append((jnp.concatenate(cells), jnp.concatenate(taken), rest))
-        steps.append(_steps(jnp.sum(rest / largest, -1, keepdims=True), area))
-    best = jnp.argmin(jax.lax.stop_gradient(jnp.stack(steps)))
-    cell, excess, rest = (jnp.stack(rows)[best] for rows in zip(*results, strict=True))
-    return cell, excess, Environment(rest)
-
-
-def _largest_cells(light: Array, area: Array, edge: int, count: int) -> tuple[Int[Array, " t"], Float[Array, "t c"]]:
-    """The cells with the most flux, and the radiance by which each exceeds the next one."""
-    mean = _means(light, area, edge).reshape(6 * edge**2, -1)
-    flux = jnp.sum(mean, -1) * jnp.sum(_squares(area, edge), (2, 4)).ravel()
-    cell = jax.lax.top_k(jax.lax.stop_gradient(flux), count + 1)[1]
-    bright = flux[cell]
-    fraction = jnp.maximum(1 - jnp.maximum(bright[-1], 0) / jnp.where(bright[:-1] > 0, bright[:-1], 1), 0)
-    fraction = jnp.where(bright[:-1] > 0, fraction, 0).astype(light.dtype)
-    return cell[:-1], mean[cell[:-1]] * fraction[:, None]
-
-
-def _squares(value: Float[Array, "6 n n c"], edge: int) -> Array:
-    """Texels by cells: [6 e f e f c]."""
-    fold = value.shape[1] // edge
-    return value.reshape(6, edge, fold, edge, fold, -1)
-
-
-def _means(value: Array, area: Array, edge: int) -> Float[Array, "6 e e c"]:
-    """Means over cells."""
-    return jnp.sum(_squares(value * area, edge), (2, 4)) / jnp.sum(_squares(area, edge), (2, 4))
-
-
-def _repeated(value: Float[Array, "6 e e c"], size: int) -> Float[Array, "6 n n c"]:
-    """Cells as texels."""
-    fold = size // value.shape[1]
-    return jnp.repeat(jnp.repeat(value, fold, 1), fold, 2)
-
-
-def _steps(light: Float[Array, "6 n n 1"], area: Array) -> Array:
-    """How much a light varies between cells, as far as lobes cannot follow it."""
-    size = light.shape[1]
-    fine = _repeated(_means(light, area, min(_JUMP, size)), size)
-    wide = _repeated(_means(light, area, _WIDE), size)
-    return jnp.sqrt(jnp.sum(area * ((fine - wide) ** 2 + (_WITHIN * (light - fine)) ** 2)))
 
 
 @require.arguments(light=protocol.one_light, count=partial(require.count, "the number of texels", least=-1))
@@ -723,25 +652,46 @@ def _points(texel: Int[Array, " t"], size: int, samples: int, spot: Float[Array,
     return direction.reshape(len(texel), -1, 3), (area * direction).reshape(len(texel), -1, 3)
 
 
-@jit
-def _vector_flux(visibility: Visibility, texel: Int[Array, " t"], excess: Float[Array, "t c"]) -> Float[Array, "c 4 v"]:
-    """Vector irradiance / pi of every vertex by texels that its normal faces, and its irradiance / pi."""
-    count, normal = len(texel), visibility.frame[:, 2].T
-    area = cubemap.vector_area(size=visibility.size).reshape(-1, 3)[texel].astype(excess.dtype)
+def _areas(texel: Int[Array, " t"], numbers: tuple[tuple[int, int], ...]) -> Float[Array, "t 3"]:
+    """Integrals of direction over texels and cells."""
+    ends = np.cumsum([number for _, number in numbers])[:-1]
+    tables = (cubemap.vector_area(size=edge).reshape(-1, 3) for edge, _ in numbers)
+    return jnp.concatenate([table[rows] for table, rows in zip(tables, jnp.split(texel, ends), strict=True)])
+
+
+@partial(jit, static_argnames=("numbers",))
+def _strongest(
+    texel: Int[Array, " t"], excess: Float[Array, "t c"], *, numbers: tuple[tuple[int, int], ...]
+) -> Int[Array, " s"]:
+    """Indices of the texels and cells with the most flux."""
+    flux = jnp.sum(excess, -1) * jnp.linalg.norm(_areas(texel, numbers), axis=-1)
+    return jax.lax.top_k(jax.lax.stop_gradient(flux), min(_STRONG, len(texel)))[1]
+
+
+@partial(jit, static_argnames=("numbers",))
+def _vector_flux(
+    normal: Float[Array, "3 v"],
+    texel: Int[Array, " t"],
+    excess: Float[Array, "t c"],
+    seen: UInt8[Array, "t v"],
+    *,
+    numbers: tuple[tuple[int, int], ...],
+) -> Float[Array, "c 4 v"]:
+    """Vector irradiance / pi of every vertex by texels and cells that its normal faces, and its irradiance / pi."""
+    count, area = len(texel), _areas(texel, numbers)
     blocks = max(-(-count // _TOGETHER), 1)
 
     def rows(value: Array) -> Array:
-        return jnp.pad(value, ((0, blocks * _TOGETHER - count), *[(0, 0)] * (value.ndim - 1))).reshape(
-            blocks, _TOGETHER, *value.shape[1:]
-        )
+        return jnp.pad(value, ((0, blocks * _TOGETHER - count), (0, 0))).reshape(blocks, _TOGETHER, -1)
 
     def flux(block: tuple[Array, Array, Array]) -> Array:
-        texel, area, excess = block
-        seen = jnp.where(_component(normal, area[:, None]) > 0, visibility.visible(texel), 0)
-        light = (excess[:, :, None] * area[:, None]).reshape(_TOGETHER, -1) / np.pi
-        return jnp.matmul(light.T, seen.astype(light.dtype), precision="highest")
+        area, excess, seen = block
+        share = jnp.where(_component(normal, area[:, None]) > 0, seen, 0).astype(excess.dtype)
+        light = (excess[:, :, None] * area[:, None]).reshape(_TOGETHER, -1) / (np.pi * FULL)
+        return jnp.matmul(light.T, share, precision="highest")
 
-    result = total(flux, (rows(texel), rows(area), rows(excess))).reshape(excess.shape[1], 3, -1)
+    whole = total(flux, (rows(area.astype(excess.dtype)), rows(excess), rows(seen)))
+    result = whole.reshape(excess.shape[1], 3, -1)
     return jnp.concatenate([result, jnp.sum(result * normal, 1, keepdims=True)], 1)
 
 

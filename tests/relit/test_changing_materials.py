@@ -41,7 +41,7 @@ KINDS = {
     "Cook-Torrance": Kind(
         CookTorrance([0.4, 0.1, 0.05], 0.3, 0.25, 0.1),
         CookTorrance([0.1, 0.3, 0.3], [0.5, 0.4, 0.1], 0.4, [0.9, 0.7, 0.2]),
-        {"roughness": 0.01, "f0": 0.05},
+        {"roughness": 0.0025, "f0": 0.05},  # no knot of the tables between
         CookTorrance(roughness=2.0),
         "must be from 0.00316 to 1, got 2",
     ),

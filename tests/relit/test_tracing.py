@@ -173,6 +173,23 @@ def mirrored_by_pixels() -> np.ndarray:
     return np.where(on_floor, mirrored(np.where(on_floor[:, None], place, 1.0)), 0)
 
 
+def test_a_mirror_of_two_triangles_shows_the_edge_of_a_wall_without_bounces():
+    plane = builtin.plane(cells=1)
+    floor = make_mesh(1.5 * np.asarray(plane.position) + [0, 0, 0.5], plane.face)
+    parts = [Part("floor", floor, mirror()), Part("wall", mesh("wall"), wall(0.0))]
+    ready = prt.precompute(Scene(parts), refine=False, system=Lobes(4, 0), size=SIZE, progress=False)
+    white = Environment(jnp.ones((6, SIZE, SIZE, 3)))
+    rays, stored = (
+        np.asarray(each.picture(white, CAMERA, samples=1)).reshape(-1, 3)[:, 0] for each in (ready, ready.with_rays(0))
+    )
+    inside = mirrored_by_pixels()
+    hidden, free = inside > 0.15, inside < -0.15
+    assert rays[hidden].max() < 0.05 < 0.3 < stored[hidden].mean()
+    np.testing.assert_allclose(rays[free], rays[free].mean(), rtol=0.1)
+    kept = ready.picture_view(CAMERA).picture(white)
+    np.testing.assert_allclose(kept, ready.picture(white, CAMERA), rtol=1e-4)
+
+
 def test_a_kept_view_gives_the_picture_of_every_light_and_of_the_closed_form(close):
     ready = relit()
     view = ready.picture_view(CAMERA)

@@ -409,6 +409,18 @@ class TexelBits(eqx.Module):
         value = self.bit.at[byte].get(mode="promise_in_bounds")
         return ((value >> bit.astype(jnp.uint8)[:, None]) & 1).astype(self.position.dtype)
 
+    def cells(self, cell: Int[Array, " t"], *, edge: int) -> Float[Array, "t v"]:
+        """Share of each of the given cells, of faces with an edge of so many cells, in texels that a vertex sees."""
+        fold, (face, row, column) = self.size // edge, _split(cell, edge)
+        first, bit = _bit(face, fold * row, fold * column, self.size)
+        if fold == 2:  # half of a byte
+            half = self.bit.at[first].get(mode="promise_in_bounds") >> bit.astype(jnp.uint8)[:, None] & 15
+            return jax.lax.population_count(half).astype(self.position.dtype) / 4
+        place = np.arange(fold // 2)[:, None] * (self.size // 4) + np.arange(fold // 4)
+        rows = (self.bit.at[first + step].get(mode="promise_in_bounds") for step in place.ravel())
+        seen = reduce(jnp.add, (jax.lax.population_count(row).astype(self.position.dtype) for row in rows))
+        return seen / fold**2
+
 
 def texel_bits(transport: LobeTransport) -> TexelBits:
     """The bits of a transport, transposed so that those of one texel are contiguous for all vertices."""
