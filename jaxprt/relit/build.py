@@ -75,8 +75,8 @@ def precompute(
             diffuse.
         rays: Number of reflection rays that each vertex or point of a sharp part sends. A part is sharp if its
             reflections are too sharp for the low-order harmonics that represent reflected light. 0 uses harmonics
-            alone. What rays hit is seen with the light that it reflects, one bounce more than `bounces`. Only used with
-            bounces; see `RelitScene.with_rays`.
+            alone. What rays hit is seen with the light that it reflects, one bounce more than `bounces`. Without
+            bounces, pictures trace rays of very smooth parts for what hides the light; see `RelitScene.with_rays`.
         refine: Largest relative L2 error that interpolation between vertices may cause in pictures, as `jaxprt.refine`
             defines it; True for 0.008, False to keep the mesh. `RelitScene.mesh` is the divided mesh, and
             `RelitScene.file_vertex` says which of its vertices are those of the scene. What is known of the lights,

@@ -138,8 +138,7 @@ class Lobes(Recipe):
 
     Attributes:
         lobes: Number of lobes of the BRDF.
-        texels: Number of brightest texels that are summed one by one; 0 for none. A Lambertian part uses 32 times as
-            many, because a texel costs it only about 1/30 as much; every bright light source then has a sharp shadow.
+        texels: Number of brightest texels that are summed one by one; 0 for none, and for no cells.
     """
 
     lobes: int = 8
