@@ -213,7 +213,7 @@ def _around(mean: list[Array], drop: Array, angle: Array) -> list[Array]:
 @jit
 def _scattered(position: Float[Array, "v 3"]) -> tuple[Float[Array, " v"], Float[Array, " v"]]:
     """Two hashed numbers in [0, 1) for each position: equal for equal positions, unrelated for neighbors."""
-    bits = position.astype(jnp.float32).view(jnp.uint32)
+    bits = position.astype(jnp.float32).view(jnp.uint32) & np.uint32(0x807FFFFF)  # the same at twice the size
     state = (
         bits[:, 0] * np.uint32(0x9E3779B1) ^ (bits[:, 1] * np.uint32(0x85EBCA77)) ^ (bits[:, 2] * np.uint32(0xC2B2AE3D))
     )

@@ -17,6 +17,7 @@ RINGS, SECTORS = 64, 96  # of the quadrature whose nodes are the samples of EM
 FINEST = 2e5  # largest concentration, a width of an eighth of a degree
 _WIDEST = 2.0  # smallest concentration relative to a single lobe's; wider lobes would average light and shadow
 _TAIL = 2  # One of this many lobes may be wider, each by the same factor, to fit the BRDF's tails,
+_FEW = 6  # lobes below which half as many may be wider
 _BROADEST = 8.0  # down to this concentration, a width of twenty degrees
 _SHARP = 50.0  # concentration above which a lobe counts as a planar normal distribution
 _CORE = 0.6  # share of the mass, nearest to the mirror direction, that sets the initial spread of lobes
@@ -55,6 +56,11 @@ def samples(
     return jax.lax.map(one, wo, batch_size=_BATCH)
 
 
+def _tails(lobes: int) -> int:
+    """Number of lobes that may be wide: a half, of few a quarter."""
+    return lobes // (_TAIL if lobes >= _FEW else 2 * _TAIL)
+
+
 @partial(jit, static_argnames=("lobes",))
 def start(
     wo: Float[Array, "v 3"], sample: Float[Array, "v s 3"], mass: Float[Array, "v s"], *, lobes: int
@@ -87,7 +93,7 @@ def start(
     drop = 2 * jnp.sum(near * away, 1)
     least = jnp.clip(_WIDEST * mixture.concentration_of(jnp.clip(drop, 1e-7, 0.8)), 1, FINEST / 2)
     mean = _reflect(wo, tilt, _LOWEST)
-    wider = jnp.maximum(number + 1 - (lobes - lobes // _TAIL), 0) / max(lobes // _TAIL, 1)
+    wider = jnp.maximum(number + 1 - (lobes - _tails(lobes)), 0) / max(_tails(lobes), 1)
     least = least[:, None] * (_BROADEST / jnp.maximum(least[:, None], _BROADEST)) ** wider
     concentration = 1.5 * least
     weight = jnp.broadcast_to(portion[:, -1:] / lobes, mean.shape[:2])

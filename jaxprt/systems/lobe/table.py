@@ -209,7 +209,7 @@ def tabulate(
     At each view node, EM fits lobes to samples on arcs around the mirror direction. All nodes start with the same
     arrangement of lobes in terms of half vectors. Between rounds of EM each node is averaged with its neighbors, so
     that corresponding lobes of adjacent nodes can be interpolated; neighbors along a BRDF parameter are averaged too,
-    relative to the width of their lobes. Half of the lobes are at most about 0.7
+    relative to the width of their lobes. Half of the lobes (three quarters of fewer than six) are at most about 0.7
     times as wide as a single lobe would be, so that they resolve light and visibility that vary over the BRDF's lobe.
     The others may be wider, to fit the tails of sharp BRDFs. The diffuse part is at most as bright as the BRDF's median
     over directions of light. The reflected energy of each node is preserved. The last
