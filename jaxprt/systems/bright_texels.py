@@ -152,19 +152,18 @@ class BrightTexels(VertexSystem):
     def light(self, environment: Environment) -> BrightLight:
         """Splits the light into its brightest texels and the rest, which the underlying system converts."""
         environment = protocol.light_for(self, environment)
-        texel, excess, rest = split(environment, count=self.count)
-        if self.cells:
-            cell, taken, even = light_cells.split(rest)
-            texel, excess = jnp.concatenate([texel, cell]), jnp.concatenate([excess, taken])
-            if self.by_lobes:
-                lobes: Any = self.system
-                return BrightLight(lobes.two_lights(rest, even), texel, excess)
-            rest = even
-        strong = _strongest(texel, excess, numbers=self._numbers) if self.cells and self._diffuse_alone else None
-        return BrightLight(self.system.light(rest), texel, excess, strong=strong)
+        if not self.cells:
+            texel, excess, rest = split(environment, count=self.count)
+            return BrightLight(self.system.light(rest), texel, excess)
+        texel, excess, rest, even, strong = _with_cells(environment, count=self.count, numbers=self._numbers)
+        if self.by_lobes:
+            lobes: Any = self.system
+            return BrightLight(lobes.two_lights(rest, even), texel, excess)
+        return BrightLight(self.system.light(even), texel, excess, strong=strong if self._diffuse_alone else None)
 
     @property
     def _diffuse_alone(self) -> bool:
+        """Whether texels are summed at vertices as one vector, since only their irradiance counts."""
         return self.matte and getattr(self.brdf, "matte", False)
 
     @property
@@ -202,8 +201,7 @@ class BrightTexels(VertexSystem):
             return light
         seen, flux = _shares(self.visibility, light.texel, light.excess, self._numbers), None
         if self._diffuse_alone:
-            normal = self.visibility.frame[:, 2].T
-            flux = _vector_flux(normal, light.texel, light.excess, seen, numbers=self._numbers)
+            flux = _vector_flux(self.visibility.frame, light.texel, light.excess, seen, numbers=self._numbers)
         return dataclasses.replace(light, seen=seen, flux=flux)
 
     def tilted(self, light: BrightLight, normal: Float[Array, "v 3"]) -> BrightLight:
@@ -659,18 +657,22 @@ def _areas(texel: Int[Array, " t"], numbers: tuple[tuple[int, int], ...]) -> Flo
     return jnp.concatenate([table[rows] for table, rows in zip(tables, jnp.split(texel, ends), strict=True)])
 
 
-@partial(jit, static_argnames=("numbers",))
-def _strongest(
-    texel: Int[Array, " t"], excess: Float[Array, "t c"], *, numbers: tuple[tuple[int, int], ...]
-) -> Int[Array, " s"]:
-    """Indices of the texels and cells with the most flux."""
+@partial(jit, static_argnames=("count", "numbers"))
+def _with_cells(
+    light: Environment, *, count: int, numbers: tuple[tuple[int, int], ...]
+) -> tuple[Int[Array, " t"], Float[Array, "t c"], Environment, Environment, Int[Array, " s"]]:
+    """Texels and cells of a light, their excess, the light without the texels and without both, and the strongest."""
+    texel, excess, rest = split(light, count=count)
+    cell, taken, even = light_cells.split(rest)
+    texel, excess = jnp.concatenate([texel, cell]), jnp.concatenate([excess, taken])
     flux = jnp.sum(excess, -1) * jnp.linalg.norm(_areas(texel, numbers), axis=-1)
-    return jax.lax.top_k(jax.lax.stop_gradient(flux), min(_STRONG, len(texel)))[1]
+    strong = jax.lax.top_k(jax.lax.stop_gradient(flux), min(_STRONG, len(texel)))[1]
+    return texel, excess, rest, even, strong
 
 
 @partial(jit, static_argnames=("numbers",))
 def _vector_flux(
-    normal: Float[Array, "3 v"],
+    frame: Float[Array, "v 3 3"],
     texel: Int[Array, " t"],
     excess: Float[Array, "t c"],
     seen: UInt8[Array, "t v"],
@@ -678,7 +680,7 @@ def _vector_flux(
     numbers: tuple[tuple[int, int], ...],
 ) -> Float[Array, "c 4 v"]:
     """Vector irradiance / pi of every vertex by texels and cells that its normal faces, and its irradiance / pi."""
-    count, area = len(texel), _areas(texel, numbers)
+    count, area, normal = len(texel), _areas(texel, numbers), frame[:, 2].T
     blocks = max(-(-count // _TOGETHER), 1)
 
     def rows(value: Array) -> Array:

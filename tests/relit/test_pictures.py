@@ -360,8 +360,7 @@ def test_color_without_a_background_is_direct_plus_reflected_light(close):
     assert list(layers) == names
     close(layers["direct"] + layers["reflected"], layers["color"], tolerance=1e-6)
     bare = relit().picture(light(), CAMERA, background=None)[..., :3]
-    close(layers["direct"], bare, tolerance=1e-3)  # The rays that show what hides the light are those of other tables.
-    bare = relit().with_rays(0).picture(light(), CAMERA, background=None)[..., :3]
+    close(layers["direct"], bare, tolerance=5e-4)  # Rays show what hides the light from narrow lobes.
     close(ready.with_rays(0).picture(light(), CAMERA, layers=["direct"])["direct"], bare, tolerance=1e-5)
     assert float(jnp.max(layers["reflected"])) > 0.01
     close(layers["alpha"], ready.coverage(CAMERA), tolerance=1e-6)
@@ -536,4 +535,4 @@ def test_the_number_of_programs_does_not_depend_on_the_number_of_parts():
             made(scene).picture(light(), CAMERA)
         counts.append(len(events))
     assert counts[1] <= counts[0] + 2
-    assert counts[1] <= 64  # with some small ones of the test's own cubemaps
+    assert counts[1] <= 62  # with some small ones of the test's own cubemaps

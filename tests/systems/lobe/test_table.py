@@ -16,7 +16,7 @@ from tests.upper import directions, upper
 
 RESOLUTION = 8
 EM = 1e-2  # Rounding in another order, through seventy steps that do not converge.
-SMOOTHED = 0.15  # Rounds of EM also average with the lobes of the neighboring knots.
+SMOOTHED = 0.05  # Rounds of EM also average with the lobes of the neighboring knots.
 DIFFERENCE = 2e-2  # Central differences in float32 of what varies over a tenth of a radian.
 
 GLOSSY = CookTorrance(diffuse=0.2, specular=0.5, roughness=0.2)
