@@ -27,7 +27,6 @@ from jaxprt.systems.lobe.table import brdf_samples, measured_error
 from jaxprt.systems.standard import tables
 from jaxprt.systems.standard.families import RoughnessFamily, SheenFamily, ShininessFamily, SlopeFamily
 
-COUNTS = (4, 8, 12, 24)  # numbers of lobes; others are fitted by who asks for them
 KNOTS, FEW = 20, 10  # FEW for lobes of sheens, which are wide
 STEPS = 1000  # of the descent
 ANGLES = 48  # view nodes of the harmonics
@@ -244,13 +243,14 @@ def main(options: Sequence[str]) -> None:
     names = [table.name for table in standard]
     kinds = "lobes", "harmonics", "columns", "paths", "tensor"
     parser.add_argument("material", nargs="*", help=", ".join(names))
-    parser.add_argument("--lobes", type=int, nargs="*", default=COUNTS)
+    parser.add_argument("--lobes", type=int, nargs="*", help="numbers of lobes; those of the file if not given")
     parser.add_argument("--only", nargs="*", default=kinds, choices=kinds)
     arguments = parser.parse_args(options)
     for name in arguments.material or names:
         material = material_of(name)
         _add(name, {"channel": material.scale, "knot": material.knots.astype(np.float32)})
-        for count in arguments.lobes if "lobes" in arguments.only else ():
+        counts = tables.StandardTable(name).counts if arguments.lobes is None else arguments.lobes
+        for count in counts if "lobes" in arguments.only else ():
             _add(name, {f"lobes{count}.{key}": value for key, value in _report(lobes, material, count).items()})
         if "harmonics" in arguments.only:
             _add(name, _report(harmonics, material))

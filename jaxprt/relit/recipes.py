@@ -134,7 +134,7 @@ class Recipe(eqx.Module):
 
 
 class Lobes(Recipe):
-    """Recipe of the lobe system. The brightest texels of the light are summed exactly, and cells for rough parts.
+    """Recipe of the lobe system. Single texels of the light are summed exactly, and cells for rough and matte parts.
 
     Attributes:
         lobes: Number of lobes of the BRDF.

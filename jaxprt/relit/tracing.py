@@ -181,30 +181,25 @@ def missed_shares(
 ) -> list[Float[Array, " v"] | None]:
     """Share of the rays of very narrow lobes that hit nothing, for points of groups that reflect no other surfaces.
 
-    The rays are those of direct light. Each result is as in `PathWeights`; None for what is traced by JAX.
+    The rays are those of lobes of direct light. Each result is as in `PathWeights`; None for all if JAX traces any of
+    the arguments.
     """
-
-    def rays_of(origin: RayOrigins) -> tuple[RayOrigins, ReflectionRays] | None:
-        surface = stage.surfaces[origin.group]
-        system = surface.system.lobe_part
-        if system is None or not known(origin.points, origin.on_group, origin.parameter, system.brdf, eye):
-            return None
-        with jax.ensure_compile_time_eval():
+    tables = [stage.surfaces[origin.group].system.lobe_part.brdf for origin in origins]
+    if not known(stage.whole, eye, tables, [(each.points, each.on_group, each.parameter) for each in origins]):
+        return [None] * len(origins)
+    cast, bundles = caster(stage.whole), []
+    with jax.ensure_compile_time_eval():
+        for origin, table in zip(origins, tables, strict=True):
+            surface = stage.surfaces[origin.group]
             place = surface.position, surface.frame, origin.on_group
-            return origin, traced.very_narrow(system.brdf, *place, eye, origin.parameter, count=stage.rays)
+            bundles.append(traced.very_narrow(table, *place, eye, origin.parameter, count=stage.rays))
 
-    def missed(pair: tuple[RayOrigins, ReflectionRays] | None) -> Float[Array, " v"] | None:
-        if pair is None:
-            return None
-        origin, rays = pair
+    def missed(origin: RayOrigins, rays: ReflectionRays) -> Float[Array, " v"]:
         rays = rays if origin.turn is None else _shared(rays, origin.turn)
         return _missed(rays, cast.blocked(rays, origin.points))
 
-    if not known(stage.whole):
-        return [None] * len(origins)
-    cast = caster(stage.whole)
     with ThreadPoolExecutor(blocks.cores()) as pool:
-        return list(pool.map(missed, [rays_of(origin) for origin in origins]))
+        return list(pool.map(missed, origins, bundles))
 
 
 def _missed(rays: ReflectionRays, triangle: Int[np.ndarray, "j v"]) -> Float[Array, " v"]:

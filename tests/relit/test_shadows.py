@@ -101,13 +101,11 @@ def test_a_kept_view_traces_new_texels_alone(relit, monkeypatch):
         traced.clear()
 
 
-@pytest.fixture(scope="module")
-def glossy():
-    """A rough metal of few vertices below a bar, and three soft boxes of more texels than are traced one by one."""
+def below_a_bar(material: TexturedMaterial) -> tuple[prt.relit.RelitScene, Environment]:
+    """A floor of few vertices below a bar, and three soft boxes of more texels than are traced one by one."""
     grid = builtin.plane(cells=5)
     bar = make_mesh(SQUARE * [0.15, 0, 1.2] + [0, 0.35, 0], FACE)
-    metal = TexturedMaterial(metallic=1.0, roughness=0.9)
-    parts = [Part("floor", grid, metal), Part("bar", bar, metal)]
+    parts = [Part("floor", grid, material), Part("bar", bar, material)]
     ready = prt.precompute(Scene(parts, [CAMERA]), refine=False, system=Lobes(4, 4), size=16, progress=False)
     radiance = np.full((6, 16, 16, 3), 0.05)
     for face, row, column in ((2, 6, 10), (2, 8, 2), (0, 4, 6)):
@@ -115,10 +113,8 @@ def glossy():
     return ready, Environment(jnp.asarray(radiance, jnp.float32))
 
 
-@pytest.fixture(scope="module")
-def off(glossy):
+def measure_of(ready: prt.relit.RelitScene, light: Environment):
     """The error of a picture of the floor in the soft boxes, relative to the norm."""
-    ready, light = glossy
     exact = exact_pixels(ready.scene, ready.shading, [light], CAMERA, pixels=300)
     assert exact.error[0] < 0.004
 
@@ -128,6 +124,25 @@ def off(glossy):
         return np.linalg.norm(wrong[there]) / np.linalg.norm(exact.color[0][there])
 
     return measure
+
+
+@pytest.fixture(scope="module")
+def glossy():
+    return below_a_bar(TexturedMaterial(metallic=1.0, roughness=0.9))
+
+
+@pytest.fixture(scope="module")
+def off(glossy):
+    return measure_of(*glossy)
+
+
+def test_soft_boxes_are_hidden_between_vertices_of_matte_parts_too():
+    ready, light = below_a_bar(TexturedMaterial(metallic=0.0, specular=0.0))
+    assert all(surface.matte for surface in ready.surfaces)
+    off = measure_of(ready, light)
+    assert off(ready.picture(light)) < 0.025  # 32 of the 48 bright texels and their cells are traced.
+    assert off(ready.picture(light, shadows="vertices")) > 0.07
+    np.testing.assert_allclose(ready.picture_view().picture(light), ready.picture(light), rtol=1e-5, atol=1e-6)
 
 
 def test_soft_boxes_are_hidden_where_they_are_between_vertices(glossy, off):

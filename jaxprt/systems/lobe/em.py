@@ -57,7 +57,7 @@ def samples(
 
 
 def _tails(lobes: int) -> int:
-    """Number of lobes that may be wide: a half, of few a quarter."""
+    """Number of lobes that may be wide."""
     return lobes // (_TAIL if lobes >= _FEW else 2 * _TAIL)
 
 
@@ -67,8 +67,8 @@ def start(
 ) -> tuple[mixture.Mixture, Float[Array, "v l"]]:
     """Initial lobes for EM, on a spiral over half vectors that covers the BRDF's core; and their concentration bounds.
 
-    The last half of the lobes have smaller bounds, so that they can widen to fit the tails of a sharp BRDF. Without
-    them EM would assign the tails to the diffuse part.
+    The last lobes, a half or of few a quarter, have smaller bounds, so that they can widen to fit the tails of a sharp
+    BRDF. Without them EM would assign the tails to the diffuse part.
 
     Args:
         wo: Unit directions to the viewer.
@@ -104,9 +104,10 @@ def start(
 def most_diffuse(
     mass: Float[Array, "v s c"], fixed: Float[Array, "v s 1"], extent: Float[Array, "v s"]
 ) -> Float[Array, "v c"]:
-    """Upper bound of the diffuse albedo: that of the BRDF's median over directions of light, weighted by cosine.
+    """Largest albedo of the diffuse part for each view and color: pi times the BRDF's median over directions of light.
 
-    Without it, the tails of a sharp BRDF would become diffuse. Arguments are those that `samples` returns.
+    Directions count by their cosine. Without this bound, the tails of a sharp BRDF would become diffuse. The arguments
+    are those that `samples` returns: mass, logarithm of the diffuse density, and extent.
     """
     measure = np.pi * jnp.exp(fixed) * 4 * np.pi * extent[..., None]
     value = jnp.where(measure > 0, mass / jnp.where(measure > 0, measure, 1), 0)

@@ -75,6 +75,9 @@ def test_cells_of_all_levels_are_the_means_of_their_texels():
         value, weight = ((share >= 8) * 1.0, np.ones_like(area)) if bits else (share / 16, area)
         squares, whole = (x.reshape(-1, 6, edge, fold, edge, fold).sum((3, 5)) for x in (value * weight, weight[None]))
         np.testing.assert_allclose(found.T, (squares / whole).reshape(3, -1), atol=0.003)
+        clear = (share >= 8).reshape(3, 6, edge, fold, edge, fold).mean((3, 5)).reshape(3, -1)
+        of_bits = jax.jit(lambda bits, edge=edge: bits.cells(jnp.arange(6 * edge**2), edge=edge))
+        np.testing.assert_allclose(of_bits(lobe.texel_bits(transport)).T, clear, rtol=1e-6)
 
 
 @pytest.mark.parametrize("value", [0, 16])
