@@ -4,8 +4,8 @@ The radiance by which a few texels exceed the rest of the light is taken out of 
 rest, with visibility that is interpolated between vertices. What the texels add is the product of radiance, BRDF and
 cosine at the point itself, times the share of the texel that rays from the point see.
 
-Cells of the light, which the systems `lobe` and `dynamic` sum too, are many. Their shares are interpolated where the
-corners of a triangle see about the same of them, and traced elsewhere.
+Cells of the light, which the systems `lobe` and `dynamic` sum too, are many. The shares of those with the most flux are
+traced where the corners of a triangle differ, and those of all others are interpolated.
 
 Rays are cast on the host. They are constants of all derivatives.
 """
@@ -42,7 +42,8 @@ _RANK = 2 * TEXELS  # What exceeds the flux of so many texels is traced; the sys
 _LEAST = 1e-3  # smallest share of the light's flux of a traced texel
 _MORE = 32  # rays of a point beyond one for each texel, if they had all of the light's flux
 _FINE = 256  # edge of the cubemap whose flux draws the places of rays within texels
-_CELL_RAYS = 128  # rays of a point to all cells beyond one for each, in proportion to their flux
+_CELLS = 48  # number of traced texels and cells of the light that arrives at a group
+_CELL_RAYS = 128  # rays of a point to these beyond one for each, in proportion to their flux
 _FEWER = 0.7  # share of the wanted rays with which a texel that was traced before is not traced again
 _KEPT, _MOST = 4, 4 * TEXELS  # number of views whose traced texels are kept, and of texels of each
 
@@ -128,21 +129,15 @@ class CellLight(NamedTuple):
         stage: The scene.
         pixels: The points of the picture.
         width: Width of the picture in drawn pixels.
-        number: Number of texels and cells.
-        chosen: Indices of those that bring light.
-        seen: Their visible shares at the vertices of the group, in 240ths.
+        seen: Visible shares of texels and cells at the vertices of the group, in 240ths.
         rays: Rays to even places in them.
-        strong: Indices of those whose shares `row` returns; None for all.
     """
 
     stage: Stage
     pixels: Pixels
     width: int
-    number: int
-    chosen: Int[np.ndarray, " n"]
-    seen: UInt8[np.ndarray, "v n"]
+    seen: UInt8[np.ndarray, "v t"]
     rays: picture_rays.TexelRays
-    strong: Int[np.ndarray, " s"] | None
 
     def row(self, index: Int[np.ndarray, " p"]) -> UInt8[Array, "t p"]:
         """Visible shares at some points of the group, in 240ths, by rays where the corners of a triangle differ.
@@ -153,28 +148,27 @@ class CellLight(NamedTuple):
         points, cast = canvas.traced(self.pixels, self.width, index), caster(self.stage.whole)
         corner = np.asarray(self.stage.face)[np.maximum(points.triangle, 0)].T
         stored = self.seen, corner - np.asarray(self.stage.shift)[corner]
-        share = np.zeros((self.number, len(index)), np.uint8)
-        share[self.chosen] = picture_rays.shares(cast.triangles, cast.occluder, points, self.rays, stored=stored)
-        return put(share if self.strong is None else share[self.strong])
+        return put(picture_rays.shares(cast.triangles, cast.occluder, points, self.rays, stored=stored))
 
 
-def _rays_to(light: BrightLight, squares: Sequence[Squares]) -> tuple[np.ndarray, picture_rays.TexelRays]:
-    """Which texels and cells bring light, and rays to even places in them, more to those with more flux."""
-    texel, excess = np.asarray(light.texel), np.asarray(light.excess, np.float64).sum(1)
-    if light.strong is not None:
-        excess = np.where(np.isin(np.arange(len(texel)), light.strong), excess, 0)
-    used, direction, flux, first = [], [], [], 0
-    for edge, count, _ in squares:
-        here = first + np.flatnonzero(excess[first : first + count])
-        if len(here):
-            even = np.broadcast_to(np.float32(0), (6, 8 * edge, 8 * edge, 1))
-            direction.append(light_samples.in_texels(texel[here], even, size=edge, count=picture_rays.PLACES))
-            flux.append(excess[here] * np.asarray(cubemap.solid_angle(size=edge)).ravel()[texel[here]])
-            used.append(here)
-        first += count
-    power = np.abs(np.concatenate(flux))
-    count = _counts(_CELL_RAYS * power / power.sum())
-    return np.concatenate(used), picture_rays.TexelRays(np.concatenate(direction), count)
+def _rays_to(light: BrightLight, squares: Sequence[Squares]) -> picture_rays.TexelRays:
+    """Rays to even places in the texels and cells with the most flux, more to those with more of it."""
+    ends = np.cumsum([square.number for square in squares])[:-1]
+    texel = np.split(np.asarray(light.texel), ends)
+    edges = [square.edge for square in squares]
+    area = [np.asarray(cubemap.solid_angle(size=edge)).ravel()[at] for edge, at in zip(edges, texel, strict=True)]
+    flux = np.abs(np.asarray(light.excess, np.float64).sum(1)) * np.concatenate(area)
+    strong = np.argsort(-flux, kind="stable")[:_CELLS]
+    strong = strong[flux[strong] > 0]
+    count = np.zeros(len(flux), int)
+    count[strong] = _counts(_CELL_RAYS * flux[strong] / flux[strong].sum())
+    direction = np.zeros((len(flux), picture_rays.PLACES, 3), np.float32)
+    for edge, at, part, traced in zip(edges, texel, np.split(direction, ends), np.split(count > 0, ends), strict=True):
+        if not traced.any():
+            continue
+        even = np.broadcast_to(np.float32(0), (6, 8 * edge, 8 * edge, 1))
+        part[traced] = light_samples.in_texels(at[traced], even, size=edge, count=picture_rays.PLACES)
+    return picture_rays.TexelRays(direction, count)
 
 
 def _counts(more: Float[np.ndarray, " t"]) -> Int[np.ndarray, " t"]:
@@ -201,10 +195,8 @@ def cells(stage: Stage, pixels: Pixels, width: int, direct: Sequence[Any]) -> It
         ):
             yield None
         else:
-            chosen, rays = _rays_to(light, system.squares)
-            seen = np.ascontiguousarray(np.asarray(light.seen)[chosen].T)
-            strong = None if light.strong is None else np.asarray(light.strong)
-            yield CellLight(stage, pixels, width, len(light.texel), chosen, seen, rays, strong)
+            seen = np.ascontiguousarray(np.asarray(light.seen).T)
+            yield CellLight(stage, pixels, width, seen, _rays_to(light, system.squares))
 
 
 def untraced(environment: Environment) -> Environment:

@@ -185,8 +185,8 @@ def missed_shares(
     the arguments.
     """
     tables = [stage.surfaces[origin.group].system.lobe_part.brdf for origin in origins]
-    given = [(origin.points, origin.on_group, origin.parameter) for origin in origins]
-    if not known(stage.whole, eye, tables, given):
+    arguments = [(origin.points, origin.on_group, origin.parameter) for origin in origins]
+    if not known(stage.whole, eye, tables, arguments):
         return [None] * len(origins)
     cast, bundles = caster(stage.whole), []
     with jax.ensure_compile_time_eval():

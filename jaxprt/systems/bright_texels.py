@@ -35,7 +35,6 @@ from jaxprt.visibility.picture_rays import FULL
 
 _ROW = 32  # texels per row, of which only the brightest is sorted at first
 _SAMPLES = (1, 2, 3, 4, 6, 8, 12, 16)
-_STRONG = 32  # texels and cells of which points of pictures on ideally diffuse surfaces know what they see
 _TOGETHER = 32  # texels whose visibility is read at once
 _value = jit(adaptive.value)
 
@@ -83,9 +82,7 @@ class BrightLight(eqx.Module):
         seen: Visible share of each of them for every vertex, in 240ths; None before `BrightTexels.shade`.
         flux: Vector irradiance / pi of every vertex by all of these texels, and then its irradiance / pi, for ideally
             diffuse surfaces; None before `BrightTexels.shade`, and for others.
-        here: Visible shares at the points of one view, in 240ths, in place of `seen`; None to interpolate that. For
-            ideally diffuse surfaces they are those of `strong` alone.
-        strong: Indices of the texels and cells with the most flux, for ideally diffuse surfaces; None for others.
+        here: Visible shares at the points of one view, in 240ths, in place of `seen`; None to interpolate that.
     """
 
     rest: PyTree
@@ -93,8 +90,7 @@ class BrightLight(eqx.Module):
     excess: Float[Array, "t c"]
     seen: UInt8[Array, "t v"] | None = None
     flux: Float[Array, "c 4 v"] | None = None
-    here: UInt8[Array, "_ p"] | None = None
-    strong: Int[Array, " s"] | None = None
+    here: UInt8[Array, "t p"] | None = None
 
 
 class BrightView(eqx.Module):
@@ -155,11 +151,11 @@ class BrightTexels(VertexSystem):
         if not self.cells:
             texel, excess, rest = split(environment, count=self.count)
             return BrightLight(self.system.light(rest), texel, excess)
-        texel, excess, rest, even, strong = _with_cells(environment, count=self.count, numbers=self._numbers)
+        texel, excess, rest, even = _with_cells(environment, count=self.count)
         if self.by_lobes:
             lobes: Any = self.system
             return BrightLight(lobes.two_lights(rest, even), texel, excess)
-        return BrightLight(self.system.light(even), texel, excess, strong=strong if self._diffuse_alone else None)
+        return BrightLight(self.system.light(even), texel, excess)
 
     @property
     def _diffuse_alone(self) -> bool:
@@ -227,7 +223,7 @@ class BrightTexels(VertexSystem):
         require.kind("the view", view, BrightView, source="BrightTexels.view")
         light, rest = self._seen(light), self.system.combine(light.rest, view.rest, points)
         if light.flux is not None:
-            sent = self._diffuse(light.flux, view, points) if light.here is None else self._traced(light, view, points)
+            sent = self._diffuse(light.flux, view, points) if light.here is None else self._traced(light, view)
             return rest + sent.T * self.system.diffuse_albedo(view.rest)
         shares: Any = light.seen if light.here is None else light.here
         points = points if light.here is None else VERTICES
@@ -254,10 +250,9 @@ class BrightTexels(VertexSystem):
         # short for the second kind, and E too dark for the first.
         return jnp.maximum(tilted + jnp.maximum(flux[:, 3] - upright, 0), 0)
 
-    def _traced(self, light: BrightLight, view: BrightView, points: Points) -> Float[Array, "c p"]:
-        """Irradiance / pi by the bright texels, of which points know what they see of the strong ones."""
-        seen, here = jnp.asarray(light.seen, view.frame.dtype), jnp.asarray(light.here, view.frame.dtype)
-        share = points.carry(seen, axis=1).at[light.strong].set(here)
+    def _traced(self, light: BrightLight, view: BrightView) -> Float[Array, "c p"]:
+        """Irradiance / pi by the bright texels, of which points know what they see."""
+        share: Any = jnp.asarray(light.here, view.frame.dtype)
         area = _areas(light.texel, self._numbers).astype(share.dtype)
         cosine = jnp.maximum(_component(view.frame[:, 2].T, area[:, None]), 0)
         return jnp.einsum("tc,tp->cp", light.excess / (np.pi * FULL), share * cosine, precision="highest")
@@ -657,17 +652,14 @@ def _areas(texel: Int[Array, " t"], numbers: tuple[tuple[int, int], ...]) -> Flo
     return jnp.concatenate([table[rows] for table, rows in zip(tables, jnp.split(texel, ends), strict=True)])
 
 
-@partial(jit, static_argnames=("count", "numbers"))
+@partial(jit, static_argnames=("count",))
 def _with_cells(
-    light: Environment, *, count: int, numbers: tuple[tuple[int, int], ...]
-) -> tuple[Int[Array, " t"], Float[Array, "t c"], Environment, Environment, Int[Array, " s"]]:
-    """Texels and cells of a light, their excess, the light without the texels and without both, and the strongest."""
+    light: Environment, *, count: int
+) -> tuple[Int[Array, " t"], Float[Array, "t c"], Environment, Environment]:
+    """Texels and cells of a light, their excess, and the light without the texels and without both."""
     texel, excess, rest = split(light, count=count)
     cell, taken, even = light_cells.split(rest)
-    texel, excess = jnp.concatenate([texel, cell]), jnp.concatenate([excess, taken])
-    flux = jnp.sum(excess, -1) * jnp.linalg.norm(_areas(texel, numbers), axis=-1)
-    strong = jax.lax.top_k(jax.lax.stop_gradient(flux), min(_STRONG, len(texel)))[1]
-    return texel, excess, rest, even, strong
+    return jnp.concatenate([texel, cell]), jnp.concatenate([excess, taken]), rest, even
 
 
 @partial(jit, static_argnames=("numbers",))

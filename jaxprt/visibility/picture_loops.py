@@ -83,29 +83,31 @@ def trace_shares(query, surface, points, first, last, texels, stored, share):
     """
     _, middle, count, _ = texels
     origin, facing = np.zeros((4, 3, _BLOCK), np.float32), np.zeros((3, _BLOCK), np.float32)
-    value, apart = np.zeros(len(count), np.uint8), np.ones(len(count), np.bool_)
-    wanted, lane, visible = np.ones((len(count), _BLOCK), np.bool_), np.empty(_BLOCK, np.int64), np.empty(16)
+    value, apart = np.zeros((_BLOCK, len(count)), np.uint8), np.ones((_BLOCK, len(count)), np.bool_)
+    lane, visible = np.empty(_BLOCK, np.int64), np.empty(16)
     step = np.empty(len(count), np.int64)  # between turns, so that the first ones are spread over the texel
+    even = np.empty(len(count), np.int32)  # largest difference of corners between which shares are interpolated
     for texel in range(len(count)):
+        even[texel] = _APART if count[texel] > 0 else 255
         step[texel] = max(1, int(_GOLDEN * count[texel]))
         while np.gcd(step[texel], count[texel]) > 1:
             step[texel] += 1
     for block in range(first, last, _BLOCK):
         size = min(_BLOCK, last - block)
         for number in range(size):
-            _start(surface, points, block + number, number, origin, facing)
-            if len(stored[0]):
-                _interpolate(stored, points, block + number, value, apart)
-            for texel in range(len(count)):
-                share[texel, block + number], wanted[texel, number] = value[texel], apart[texel]
+            if not len(stored[0]) or _interpolate(stored, points, block + number, even, value[number], apart[number]):
+                _start(surface, points, block + number, number, origin, facing)
         for texel in range(len(count)):
             way, some = middle[texel], 0
             for number in range(size):
+                share[texel, block + number] = value[number, texel]
+                if not apart[number, texel]:
+                    continue
                 cosine = facing[0, number] * way[0] + facing[1, number] * way[1] + facing[2, number] * way[2]
-                if wanted[texel, number] and cosine > 0:
+                if cosine > 0:
                     lane[some] = number
                     some += 1
-                elif wanted[texel, number]:
+                else:
                     share[texel, block + number] = 0
             for packet in range(0, some, 16):
                 here = lane[packet : min(packet + 16, some)]
@@ -115,16 +117,18 @@ def trace_shares(query, surface, points, first, last, texels, stored, share):
 
 
 @numba_loop
-def _interpolate(stored, points, point, value, apart):
-    """Shares that a point sees, between those of the corners of its triangle, and where these are apart."""
+def _interpolate(stored, points, point, even, value, apart):
+    """Sets shares that a point sees, between those of the corners of its triangle; and if and where these are apart."""
     seen, corner = stored
     first, second, third = seen[corner[0, point]], seen[corner[1, point]], seen[corner[2, point]]
     weight = points[1][point]
-    for texel in range(len(value)):
-        a, b, c = np.float32(first[texel]), np.float32(second[texel]), np.float32(third[texel])
-        apart[texel] = max(max(a, b), c) - min(min(a, b), c) > _APART
-        between = max(a * weight[0] + b * weight[1] + c * weight[2], np.float32(0))
-        value[texel] = np.uint8(between + np.float32(0.5))
+    x, y, z = weight[0], weight[1], weight[2]
+    for texel in range(len(value)):  # vectorized
+        a, b, c = np.int32(first[texel]), np.int32(second[texel]), np.int32(third[texel])
+        apart[texel] = max(max(a, b), c) - min(min(a, b), c) > even[texel]
+        between = np.float32(a) * x + np.float32(b) * y + np.float32(c) * z + np.float32(0.5)
+        value[texel] = np.uint8(np.int32(between if between > np.float32(0) else np.float32(0)))
+    return apart.any()
 
 
 @numba_loop

@@ -62,7 +62,8 @@ class TexelRays(NamedTuple):
 
     Attributes:
         direction: Unit directions of places within each texel, in world space.
-        per_texel: Number of rays of each point to each texel, at most the number of places.
+        per_texel: Number of rays of each point to each texel, at most the number of places; 0 where stored shares are
+            interpolated everywhere.
     """
 
     direction: Float32[np.ndarray, "t n 3"]

@@ -140,7 +140,7 @@ def test_soft_boxes_are_hidden_between_vertices_of_matte_parts_too():
     ready, light = below_a_bar(TexturedMaterial(metallic=0.0, specular=0.0))
     assert all(surface.matte for surface in ready.surfaces)
     off = measure_of(ready, light)
-    assert off(ready.picture(light)) < 0.025  # 32 of the 48 bright texels and their cells are traced.
+    assert off(ready.picture(light)) < 0.025  # 48 of the bright texels and cells are traced.
     assert off(ready.picture(light, shadows="vertices")) > 0.07
     np.testing.assert_allclose(ready.picture_view().picture(light), ready.picture(light), rtol=1e-5, atol=1e-6)
 
