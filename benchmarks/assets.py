@@ -178,7 +178,7 @@ def judge(
     """
     start = time.perf_counter()
     request = {"path": path, "lights": lights, "edge": edge, "size": size, "samples": samples, "model": model}
-    request["bounces"] = bounces
+    request["bounces"] = BOUNCES * bounces
     ours, reason = in_process("relight", request, folder, warm=warm, limit=limit)
     line = {"benchmark": "assets", "case": "/".join(path.parts[-2:]), "compile_seconds": None, "error": None}
     line |= {"bytes": path.stat().st_size, "seconds": time.perf_counter() - start, "loaded": ours is not None}
@@ -388,8 +388,8 @@ def rendered(
     """
     if known is not None and _certain(*known, drawn):
         return known
-    bounces = BOUNCES * request["bounces"]
-    view = asset_scenes.View(surfaces, light, request["camera"], model=request["model"], bounces=bounces)
+    options = {name: request[name] for name in ("model", "bounces")}
+    view = asset_scenes.View(surfaces, light, request["camera"], **options)
     total, blocks, sides = (np.zeros(()), 0, np.stack(view.sides())) if known is None else known
     while not blocks or not _certain(total, blocks, sides, drawn):
         seeds = (2 * blocks + 1, 2 * blocks + 2)

@@ -186,6 +186,24 @@ def test_a_white_surface_in_even_light_is_as_bright_as_the_light(picture, model)
 
 
 @traced
+def test_the_judge_reflects_light_as_often_as_asked(tmp_path):
+    upright = CORNER @ [[0, 0, 1], [0, 1, 0], [-1, 0, 0]] + [1, 0, 1]
+    wall = asset_files.Surface(upright, FACE, None, {}, None, quad().material)
+    path, camera = tmp_path / "light.exr", Camera([0.0, 0.0, 4.0], [0, 0, 0], [0, 1, 0], 0.1, 4, 4)
+    files.write_exr(path, np.ones((16, 32, 3), np.float32))
+    found = []
+    for bounces in (0, 1, 39):
+        request = {"camera": camera, "samples": 2048, "model": "gltf", "bounces": bounces}
+        total, blocks, _ = assets.rendered([quad(), wall], path, request, np.zeros((4, 4, 4)), None)
+        found.append(total[..., 0].mean() / blocks)
+    once = asset_scenes.View([quad(), wall], path, camera, model="gltf", bounces=1).picture(4096, 3)[..., 0].mean()
+    direct, one, many = found
+    assert one == pytest.approx(once, rel=0.01)
+    assert one > 1.05 * direct
+    assert many > 1.02 * one
+
+
+@traced
 def test_the_sides_of_a_light_file_are_those_of_the_conventions(picture):
     turned = CORNER[:, [2, 1, 0]] * [1, 1, -1]  # towards +x
     surface = quad()
