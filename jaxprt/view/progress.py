@@ -1,14 +1,11 @@
 """What a session prepares, for the page, and for the program that waits for it."""
 
-import os
-import sys
 import threading
 from collections.abc import Sequence
 
 from jaxprt.files.inputs import JsonObject
 
 COMPILING = "compiling programs for changes"  # the last stage, after which the scene is complete
-_LOWER = 10  # by which the priority of a thread is reduced
 
 
 class EndedError(Exception):
@@ -117,9 +114,3 @@ class _Way:
         if place is not None:
             (_, part), *self._left = self._left[place:]
             self._last += (1 - self._done) * part / (part + sum(other for _, other in self._left))
-
-
-def yield_cores() -> None:
-    """Lowers the priority of this thread, and of threads that it starts, so that answers come first."""
-    if sys.platform == "linux":  # the only system with priorities of threads
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _LOWER)

@@ -1,5 +1,6 @@
 """Answers the messages of a viewer."""
 
+import contextlib
 import dataclasses
 import os
 import pathlib
@@ -9,7 +10,7 @@ import threading
 import time
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -29,7 +30,7 @@ from jaxprt.systems import protocol
 from jaxprt.view import messages, stages
 from jaxprt.view.content import light_texels, mip_edges, page_content, unshadowed_content
 from jaxprt.view.messages import Lamp, Look, Message, Reply
-from jaxprt.view.progress import COMPILING, EndedError, Progress, yield_cores
+from jaxprt.view.progress import COMPILING, EndedError, Progress
 from jaxprt.view.reduced import PageScene
 from jaxprt.view.stages import Stages
 from jaxprt.view.unshadowed import Unshadowed
@@ -43,6 +44,7 @@ _MOST_PIXELS = 1 << 24  # of a picture that is saved
 _FINE_PIXELS = 1 << 22  # up to which such a picture has 16 samples a pixel in place of 4
 _SKY_ROWS = 2048.0  # most rows of the picture of a light
 _VIEWERS = 64  # most viewers whose newest look is remembered
+_YIELD = 0.5  # most seconds for which each step of what is prepared waits for answers
 
 
 class _LateError(Exception):
@@ -62,6 +64,7 @@ class Session:
 
     There is no queue, because the browser requests one look at a time. Looks are answered while full-quality pictures
     are being computed. A picture is abandoned between two of its steps when the same viewer has sent a newer look.
+    Between two steps of what is prepared, answers come first.
 
     A session may start without a scene: `prepare` computes scenes in a thread, the page shows what is being done, and
     `show` replaces the scene by a better one, while camera, light and materials stay.
@@ -88,6 +91,7 @@ class Session:
         """
         self.progress = Progress()
         self._lock = threading.Lock()
+        self._quiet, self._answering = threading.Condition(), 0
         self._newest: OrderedDict[str, int] = OrderedDict()  # sequence number of the newest look of each viewer
         self._ended = False
         self._version: _Version | None = None
@@ -191,7 +195,6 @@ class Session:
         threading.Thread(target=self._prepare, args=(make,), name="jaxprt-prepare", daemon=True).start()
 
     def _prepare(self, make: Callable[[], None]) -> None:
-        yield_cores()
         try:
             make()
             self.progress.prepared()
@@ -209,9 +212,11 @@ class Session:
         Raises:
             EndedError: The session has ended.
         """
+        self.progress.report(stage, share)
+        with self._quiet:
+            self._quiet.wait_for(lambda: self._ended or not self._answering, _YIELD)
         if self._ended:
             raise EndedError
-        self.progress.report(stage, share)
 
     def end(self) -> None:
         """Abandons what is being computed, because nobody waits for it any more."""
@@ -235,13 +240,26 @@ class Session:
         try:
             if kind not in kinds:
                 raise ValueError(f"the kind of a message must be one of {', '.join(kinds)}, got {kind[:80]!r}")
-            return kinds[kind](message, buffers)
+            with self._answered():
+                return kinds[kind](message, buffers)
         except _LateError:
             return Reply({"kind": "late", "seq": message.get("seq")}, [])
         except (ValueError, TypeError, OSError, MemoryError) as error:
             return Reply({"kind": "error", "of": kind, "message": str(error)}, [])
         except Exception as error:  # a fault of the viewer: its page tells the user, and goes on
             return Reply({"kind": "error", "of": kind, "message": f"{type(error).__name__}: {error}"}, [])
+
+    @contextlib.contextmanager
+    def _answered(self) -> Iterator[None]:
+        """Counts the messages that are being answered."""
+        with self._quiet:
+            self._answering += 1
+        try:
+            yield
+        finally:
+            with self._quiet:
+                self._answering -= 1
+                self._quiet.notify_all()
 
     def picture(self) -> Float[np.ndarray, "h w 3"]:
         """The first picture of the viewer, from vertex radiance, encoded for display."""
@@ -260,11 +278,12 @@ class Session:
         return Reply({"kind": "sky", "scale": scale, "width": width, "height": height, "levels": len(levels)}, [data])
 
     def _progress(self, message: Message, buffers: Sequence[bytes]) -> Reply:
-        """What is being prepared, and the number of scenes so far. It grows when there is a better scene."""
+        """What is being prepared, and the numbers of scenes so far and of lights, by which pages see what is new."""
         # A page says how large its pictures are, so that their programs can be compiled ahead.
         if "width" in message:
             self._size = _size(message)[:2]
-        return Reply(self.progress.content() | {"version": self.version}, [])
+        lights = 0 if self._version is None else len(self.stages.lights)
+        return Reply(self.progress.content() | {"version": self.version, "lights": lights}, [])
 
     def _scene(self, message: Message, buffers: Sequence[bytes]) -> Reply:
         if self._version is None:

@@ -280,6 +280,20 @@ def test_two_viewers_at_once_and_a_tab_opened_again(browser, server, hand):
     again.page.close()
 
 
+def test_a_light_that_was_dropped_on_another_page_is_there_when_the_hand_comes_back(browser, server, hand, tmp_path):
+    path = tmp_path / "green.exr"
+    files.write_exr(path, np.broadcast_to(np.float32([0, 0.5, 0]), (8, 16, 3)))
+    other = Hand(browser, server.url)
+    drop(hand, path.name, path.read_bytes())
+    hand.page.wait_for_function(f"() => ({CANVAS}).state.light >= 2")
+    other.page.mouse.move(60, 60)
+    root = "document.querySelector('#viewer').shadowRoot"
+    other.page.wait_for_function(f"() => [...{root}.querySelectorAll('option')].some((each) => each.text === 'green')")
+    other.settle()
+    assert other.state()["light"] == 0
+    other.page.close()
+
+
 def test_a_server_that_was_killed_is_told_and_the_viewer_goes_on_when_it_is_back(browser, systems, lights):
     server = Server(Session(systems, environments=lights))
     hand = Hand(browser, server.url)

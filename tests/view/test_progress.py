@@ -9,6 +9,7 @@ from jax._src import compiler
 
 from jaxprt import files
 from jaxprt.view import Server, Session
+from jaxprt.view.messages import Reply
 from jaxprt.view.progress import EndedError, Progress
 from tests.view.hand import CANVAS
 
@@ -36,6 +37,7 @@ def test_a_scene_that_was_there_from_the_start_is_finished(session):
         "stage": "",
         "fraction": 0.0,
         "version": 1,
+        "lights": 2,
         "finished": True,
     }
     assert session.answer({"kind": "scene"}).content["version"] == 1
@@ -43,7 +45,8 @@ def test_a_scene_that_was_there_from_the_start_is_finished(session):
 
 def test_without_a_scene_progress_is_told_and_other_questions_say_why_they_wait(empty, look):
     empty.report("tracing rays", 0.25)
-    state = {"kind": "progress", "stage": "tracing rays", "fraction": 0.25, "version": 0, "finished": False}
+    state = {"kind": "progress", "stage": "tracing rays", "fraction": 0.25, "version": 0, "lights": 0}
+    state |= {"finished": False}
     assert progress(empty) == state
     assert empty.answer({"kind": "scene"}).content == state
     for kind in ("look", "still", "sky", "drop"):
@@ -130,6 +133,29 @@ def test_the_error_is_raised_at_once_when_a_page_was_told(empty):
     with pytest.raises(OSError, match="the disk is full"):
         empty.progress.wait(patience=1e6)  # no test lasts so long
     told.join()
+
+
+def test_each_step_of_what_is_prepared_waits_for_answers(empty, monkeypatch):
+    monkeypatch.setattr("jaxprt.view.session._YIELD", 60)
+    asked, let, order = threading.Event(), threading.Event(), []
+
+    def answer(message, buffers):
+        asked.set()
+        let.wait(60)
+        order.append("answer")
+        return Reply({"kind": "sky"}, [])
+
+    monkeypatch.setattr(empty, "_sky", answer)
+    page = threading.Thread(target=empty.answer, args=({"kind": "sky"},))
+    page.start()
+    assert asked.wait(60)
+    step = threading.Thread(target=lambda: (empty.report("tracing rays", 0.5), order.append("step")))
+    step.start()
+    step.join(0.2)
+    let.set()
+    step.join(60)
+    page.join(60)
+    assert order == ["answer", "step"]
 
 
 def test_a_session_that_ends_stops_its_preparation_at_the_next_report(empty):

@@ -302,17 +302,21 @@ export function mount(root, ask) {
   const start = () => {
     unfollow();
     resize();
-    unfollow = follow(ask, () => ({ width: canvas.width, height: canvas.height }), (content) => {
-      if (content.kind === "error") return tell(content.message);
-      if (content.error) tell(content.error);
-      waiting.set("progress", content.finished ? "" : content.stage, content.fraction);
-      if (content.version > (scene?.version ?? 0)) load();
-      else if (content.finished && bouncing) {
-        bouncing = false;
-        set({ bounces: true });
-      }
-    });
+    unfollow = follow(ask, () => ({ width: canvas.width, height: canvas.height }), heard);
   };
+  const heard = (content) => {
+    if (content.kind === "error") return tell(content.message);
+    if (content.error) tell(content.error);
+    waiting.set("progress", content.finished ? "" : content.stage, content.fraction);
+    if (content.version > (scene?.version ?? 0) || (scene && content.lights > scene.lights.length)) load();
+    else if (content.finished && bouncing) {
+      bouncing = false;
+      set({ bounces: true });
+    }
+  };
+  // A light may have been dropped on another page of the same scene.
+  const returned = async () => { try { heard((await ask({ kind: "progress" })).content); } catch { /* the next look tells */ } };
+  frame.addEventListener("pointerenter", returned);
   const load = async () => {
     if (loading) return;
     loading = true;
