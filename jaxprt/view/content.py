@@ -15,9 +15,10 @@ from jaxprt.brdf.varying import Channels
 from jaxprt.files.inputs import JsonObject
 from jaxprt.relit.channels import Shading
 from jaxprt.scene import Environment, Part, TexturedMaterial, material_table
-from jaxprt.scene.material import Texture
+from jaxprt.scene.material import Texture, opacity_of_parts
 from jaxprt.scene.material_table import MaterialTable
-from jaxprt.scene.texture import unit_normals
+from jaxprt.scene.mesh import Opacity
+from jaxprt.scene.texture import WRAPS, unit_normals
 from jaxprt.sphere import cubemap
 from jaxprt.systems import standard
 from jaxprt.systems.lobe import blurred_light
@@ -76,6 +77,7 @@ def scene_content(page: PageScene) -> tuple[JsonObject, list[bytes]]:
     stride = 0 if scale is None else int(scale.total - scale.start[page.level])
     arrays: list[list[np.ndarray]] = [[] for _ in range(6)]
     tilted, mapped = _tilted_normals(page, materials), False
+    opacity = opacity_of_parts(page.scene.parts)
     rows = zip(page.scene.parts, page.shading, page.parts, bits, tilted, strict=True)
     for part, shading, held, bit, direction in rows:
         start, table = tables.add(f"part {part.name!r}", held)
@@ -87,6 +89,8 @@ def scene_content(page: PageScene) -> tuple[JsonObject, list[bytes]]:
         about |= {"name": part.name, "count": count, "channels": weight.shape[1] - 1}
         about |= {"nodes": table.shape[1], "entries": table.shape[2], "terms": -(-len(held.vector) // 4) * 4}
         about |= {"weightStep": 0 if described else weight.shape[1], **(described or {})}
+        if opacity is not None and opacity.layer[place["first"]]:
+            about["opacity"] = _opacity_json(opacity, int(opacity.layer[place["first"]]), images)
         parts.append(about | place | {"tableStart": start})
         weight = weight[:1] if described else weight
         vector = _bytes(held.vector, unit, terms)
@@ -110,7 +114,8 @@ def scene_content(page: PageScene) -> tuple[JsonObject, list[bytes]]:
     coordinate = np.asarray(materials.coordinate)[:count] if images.described else np.zeros((0, 4))
     tangent = np.asarray(materials.frame)[:count, 3:7] if mapped else np.zeros((0, 4))
     tangent = np.round(127 * np.clip(tangent, -1, 1)).astype("i1")
-    joined += [coordinate.astype("<f4"), tangent.reshape(-1), *images.data]
+    clear = np.zeros((0, 3)) if opacity is None else np.column_stack([opacity.coordinate, opacity.factor])
+    joined += [coordinate.astype("<f4"), tangent.reshape(-1), clear.astype("<f4"), *images.data]
     content["images"] = images.described
     joined[2] = np.append(joined[2], np.zeros(4 - len(joined[2]) % 4, np.uint8))  # whole words
     added, reflected = _reflected(page)
@@ -176,20 +181,40 @@ class _Images:
         colored, normal = name in _COLORED, name == "normal"
         key = id(texture.image), "color" if colored else "normal" if normal else "value"
         if key not in self._number:
-            value = np.asarray(unit_normals(texture.image) if normal else texture.image, np.float64)
-            while max(value.shape[:2]) > _IMAGE and not (value.shape[0] % 2 or value.shape[1] % 2):
-                value = value.reshape(value.shape[0] // 2, 2, value.shape[1] // 2, 2, -1).mean((1, 3))
-            value = np.clip(value, 0, 1)
+            value = np.clip(_halved(np.asarray(unit_normals(texture.image) if normal else texture.image)), 0, 1)
             if colored:
                 value = np.broadcast_to(value, (*value.shape[:2], 3))
                 value = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
-            height, width, channels = value.shape
-            self._number[key] = len(self.data)
-            self.described.append({"width": width, "height": height, "channels": channels})
             # Normals are 127 (normal + 1), so that their zeros and ones are exact.
-            self.data.append(np.round((254 if normal else 255) * value).astype(np.uint8))
+            self._number[key] = self.append((254 if normal else 255) * value)
         how = {"transform": np.asarray(texture.transform, float).tolist(), "set": texture.set, "wrap": texture.wrap}
         return {"image": self._number[key], **how}
+
+    def append(self, value: Float[np.ndarray, "h w c"]) -> int:
+        """The number of a new image of bytes."""
+        height, width, channels = value.shape
+        self.described.append({"width": width, "height": height, "channels": channels})
+        self.data.append(np.round(value).astype(np.uint8))
+        return len(self.data) - 1
+
+
+def _halved(value: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "_ _ c"]:
+    """An image with half as many rows and columns, as often as it has more than pages take."""
+    value = np.asarray(value, np.float64)
+    while max(value.shape[:2]) > _IMAGE and not (value.shape[0] % 2 or value.shape[1] % 2):
+        value = value.reshape(value.shape[0] // 2, 2, value.shape[1] // 2, 2, -1).mean((1, 3))
+    return value
+
+
+def _opacity_json(opacity: Opacity, layer: int, images: _Images) -> JsonObject:
+    """Where a part with holes or of translucent material is there, and the image that multiplies its opacity."""
+    about: JsonObject = {"cutoff": float(opacity.cutoff[layer])}
+    start, (height, width) = int(opacity.start[layer]), opacity.shape[layer]
+    if start < 0:
+        return about
+    image = np.asarray(opacity.texel[start : start + height * width]).reshape(height, width, 1)
+    wrap = [WRAPS[number] for number in opacity.wrap[layer]]
+    return about | {"image": images.append(255 * _halved(image)), "wrap": wrap}
 
 
 def _bytes(value: Float[np.ndarray, "k v"], unit: Float[np.ndarray, " m"], length: int) -> Float[np.ndarray, "v l"]:

@@ -140,6 +140,14 @@ def bumps(amplitude):
     return Texture((slope / np.linalg.norm(slope, axis=-1, keepdims=True) + 1) / 2)
 
 
+def clear(mode):
+    """A material with holes, or one that hides a share of what is behind it, by an image of large squares."""
+    squares = np.kron([[1.0, 0.2], [0.3, 0.8]], np.ones((4, 4)))[..., None]
+    image = Texture(squares, wrap=("repeat", "mirror"))
+    options = {"metallic": 0.0, "roughness": 0.5, "alpha_mode": mode, "alpha_texture": image}
+    return TexturedMaterial(base_color=(0.9, 0.4, 0.2), **options)
+
+
 def mapped(**parameters):
     """A material with a normal map, whose image of emission no other texture shares."""
     glow = Texture(np.random.default_rng(4).uniform(0, 1, (8, 8, 3)))
@@ -157,6 +165,8 @@ CASES = {
     "textured": (textured(), MATTE, prt.relit.Lobes(8, texels=2)),
     "metal": (METAL, GLOSSY, prt.relit.Lobes(8, texels=2)),
     "harmonic": (GLOSSY, MATTE, prt.relit.Harmonics(2)),
+    "holes": (clear("mask"), MATTE, prt.relit.Lobes(8, texels=2)),
+    "translucent": (clear("blend"), MATTE, prt.relit.Lobes(8, texels=2)),
 }
 
 
@@ -238,15 +248,46 @@ def test_visibility_is_expanded_in_slices_between_which_the_page_goes_on(browser
     assert 0 < np.mean(np.asarray(still["after"]) > 0) <= 1
 
 
-def test_light_view_and_material_change_without_python(browser, systems, lights):
-    bare = systems["lobes"].without_bounces()
-    server = Server(session := Counted(bare, environments=lights))
-    hand = Hand(browser, server.url)
+def by_gpu(browser, url):
+    """A tab whose pictures are the GPU's alone."""
+    hand = Hand(browser, url)
     hand.page.wait_for_function(f"() => ({CANVAS}).pixels?.()")
     hand.page.evaluate(f"() => ({CANVAS}).pixels().patient = true")  # however slow it is
     hand.page.locator("canvas.canvas").focus()
     hand.page.keyboard.press("p")  # no pictures by Python
     hand.settle()
+    return hand
+
+
+def camera_of(hand):
+    """The camera of what a tab shows."""
+    camera, (height, width) = hand.camera(), hand.pixels().shape[:2]
+    return Camera(camera["eye"], camera["target"], [0.0, 1.0, 0.0], camera["angle"], width, height)
+
+
+def test_the_sky_and_the_ground_are_seen_through_translucent_surfaces(browser, lights):
+    # Light adds up before it is displayed: dark glass would be half as clear if displayed colors were mixed.
+    dark = TexturedMaterial(base_color=0.02, metallic=0.0, roughness=0.5, alpha_mode="blend", alpha=0.25)
+    options = {"refine": False, "system": prt.relit.Lobes(8, texels=2), "size": SIZE, "progress": False}
+    relit = prt.precompute(scene_of(dark, MATTE), **options)
+    server = Server(Session(relit, environments=lights))
+    hand = by_gpu(browser, server.url)
+    hand.drag((100, 100), (130, 80))
+    hand.page.wait_for_function(f"() => ({CANVAS}).pixels().stats.samples === 9", timeout=120_000)
+    stops = float(hand.state()["stops"])
+    page = PageScene.for_gpu(relit).relit()
+    true = page.picture(lights["lamp"], camera_of(hand), shadows="vertices")
+    off = np.abs(hand.pixels() - np.asarray(image.display(image.expose(true, stops=stops)))).max(-1)
+    assert np.quantile(off, 0.98) < 4 / 255  # The ball fills a 25th of the picture.
+    server.close()
+    hand.page.close()
+    assert not hand.errors
+
+
+def test_light_view_and_material_change_without_python(browser, systems, lights):
+    bare = systems["lobes"].without_bounces()
+    server = Server(session := Counted(bare, environments=lights))
+    hand = by_gpu(browser, server.url)
     before = session.asked["look"]
     hand.drag((100, 100), (160, 130))
     hand.page.keyboard.press("l")
@@ -256,9 +297,7 @@ def test_light_view_and_material_change_without_python(browser, systems, lights)
     hand.page.wait_for_function(f"() => ({CANVAS}).pixels().stats.samples > 1", timeout=120_000)
     assert session.asked["look"] == before
     assert "GPU" in hand.page.evaluate(LINE)
-    state, camera, found = hand.state(), hand.camera(), hand.pixels()
-    height, width = found.shape[:2]
-    view = Camera(camera["eye"], camera["target"], [0.0, 1.0, 0.0], camera["angle"], width, height)
+    state, view, found = hand.state(), camera_of(hand), hand.pixels()
     assert state["materials"] == changed
     materials = {"ball": stages.change_material(bare.scene.parts[0].material, "ball", changed["ball"])}
     page = PageScene.for_gpu(bare).relit()
@@ -303,7 +342,7 @@ def test_why_a_scene_is_not_shaded_by_the_gpu_is_said(systems, lights, look):
         PageScene.for_gpu(rough)
     session = Session({"lobes": bare, "others": others}, environments=lights)
     content, buffers = session.answer({"kind": "page", "system": "lobes"})
-    assert (content["kind"], content["visibility"], len(buffers)) == ("page", True, 10 + len(content["rims"]) + 2)
+    assert (content["kind"], content["visibility"], len(buffers)) == ("page", True, 11 + len(content["rims"]) + 2)
     content, buffers = session.answer({"kind": "page", "system": "others"})
     assert "part 'ball' must have the transfer matrices of direct light" in content["missing"]
     assert not buffers

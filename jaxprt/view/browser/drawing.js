@@ -34,14 +34,19 @@ precision highp float; in vec3 c; out vec4 o; ${DISPLAY}
 void main(){ o = vec4(gl_FrontFacing ? display(c) : vec3(0), 1); } // backs are black, as in pictures`;
 const QUAD = `#version 300 es
 out vec2 at; void main(){ at = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.; gl_Position = vec4(at * 2. - 1., .99999, 1); }`;
+const TOWARDS = `vec2 place() { vec3 d = normalize(ray * vec3(at * 2. - 1., 1));
+  return vec2(.5 - (atan(d.x, d.z) - turn) / 6.283185307, .5 - asin(clamp(d.y, -1., 1.)) / 3.141592654); }`;
 const SKY = `#version 300 es
 precision highp float; in vec2 at; out vec4 o; uniform sampler2D image; uniform mat3 ray; uniform float turn, lod; ${DISPLAY}
-void main(){ vec3 d = normalize(ray * vec3(at * 2. - 1., 1));
-  float lon = atan(d.x, d.z) - turn; vec2 uv = vec2(.5 - lon / 6.283185307, .5 - asin(clamp(d.y, -1., 1.)) / 3.141592654);
-  o = vec4(display(textureLod(image, uv, lod).rgb), 1); }`; // of derivatives there would be a seam
+${TOWARDS}
+void main(){ o = vec4(display(textureLod(image, place(), lod).rgb), 1); }`; // of derivatives there would be a seam
 const SHADED = `#version 300 es
 precision highp float; in vec2 at; out vec4 o; uniform sampler2D image; ${DISPLAY}
 void main(){ vec4 c = textureLod(image, at, 0.); o = vec4(display(c.rgb / max(c.a, 1e-3)), c.a); }`; // colors times coverage
+const THROUGH = `#version 300 es
+precision highp float; in vec2 at; out vec4 o; uniform sampler2D image, behind; uniform mat3 ray; uniform float turn, lod, bright; ${DISPLAY}
+${TOWARDS}
+void main(){ vec4 c = textureLod(image, at, 0.); o = vec4(display(c.rgb + (1. - c.a) * bright * textureLod(behind, place(), lod).rgb), 1); }`;
 const STILL = `#version 300 es
 precision highp float; in vec2 at; out vec4 o; uniform sampler2D image; uniform float alpha; ${DISPLAY}
 void main(){ vec4 c = textureLod(image, vec2(at.x, 1. - at.y), 0.); o = vec4(display(c.rgb), alpha * c.a); }`;
@@ -77,6 +82,7 @@ export class Drawing {
     this.colored = program(COLORED, MESH);
     this.shaded = program(QUAD, SHADED);
     this.sky = program(QUAD, SKY);
+    this.through = program(QUAD, THROUGH);
     this.still = program(QUAD, STILL);
     this.empty = gl.createVertexArray();
     this.array = gl.createVertexArray();
@@ -164,14 +170,24 @@ export class Drawing {
     gl.viewport(0, 0, width, height);
     gl.clearColor(...ground);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    if (state.background && this.skyImage) {
-      this.quad(this.sky, this.skyImage, gain * this.skyScale, false, tone);
-      gl.uniformMatrix3fv(this.sky.at("ray"), false, camera.ray(width / height));
-      gl.uniform1f(this.sky.at("turn"), state.turn);
-      gl.uniform1f(this.sky.at("lod"), Math.log2((2 * Math.tan(camera.angle / 2) * this.skyHeight) / (height * Math.PI)));
+    const sky = state.background && this.skyImage, through = sky && image && gpu.piece.blends; // light adds up before it is displayed
+    if (sky) {
+      const program = through ? this.through : this.sky;
+      if (through) this.quad(program, image.handle, gain, false, tone);
+      else this.quad(program, this.skyImage, gain * this.skyScale, false, tone);
+      gl.uniformMatrix3fv(program.at("ray"), false, camera.ray(width / height));
+      gl.uniform1f(program.at("turn"), state.turn);
+      gl.uniform1f(program.at("lod"), Math.log2((2 * Math.tan(camera.angle / 2) * this.skyHeight) / (height * Math.PI)));
+      if (through) {
+        gl.activeTexture(gl.TEXTURE0 + gpu.stencilUnit);
+        gl.bindTexture(gl.TEXTURE_2D, this.skyImage);
+        gl.uniform1i(program.at("behind"), gpu.stencilUnit);
+        gl.uniform1f(program.at("bright"), this.skyScale);
+      }
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
     gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    if (through) return;
     if (image) {
       gl.enable(gl.BLEND);
       this.quad(this.shaded, image.handle, gain, false, tone);

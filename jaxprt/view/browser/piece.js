@@ -27,11 +27,14 @@ export class Piece {
     this.bits = next(Uint8Array);
     this.coordinates = next(Float32Array);
     this.tangents = next(Int8Array);
+    this.opacities = next(Float32Array); // place in the image, and factor, of each vertex
     this.images = content.images.map(() => next(Uint8Array));
     this.reflected = next(Int8Array);
     this.index = new Map(content.rims.map((edge) => [edge, next(Uint32Array)]));
     this.lights = Array.from({ length: content.lights }, () => next(Float32Array));
     this.count = this.position.length / 3;
+    this.runs = runs(content.parts, this.face);
+    this.blends = content.parts.some((part) => part.opacity?.cutoff < 0);
   }
   // Means of visibility, where only bits were sent: to await before `build`.
   async expand() {
@@ -62,6 +65,7 @@ export class Piece {
     this.texture("table", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.table, 4);
     this.texture("weights", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.weights, 4);
     this.texture("coordinates", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.coordinates, 4);
+    this.texture("opacities", gl.RGB32F, gl.RGB, gl.FLOAT, this.opacities, 3);
     this.texture("visible", gl.RGBA8I, gl.RGBA_INTEGER, gl.BYTE, this.visible, 4);
     this.texture("reflected", gl.RGBA8I, gl.RGBA_INTEGER, gl.BYTE, this.reflected, 4);
     for (const name of ["light", "bright", "gathered"]) this.texture(name, gl.RGBA32F, gl.RGBA, gl.FLOAT, none, 4);
@@ -88,6 +92,7 @@ export class Piece {
     for (const part of content.parts) {
       part.written = "";
       part.samplers = TEXTURES.map((name) => part.textures?.[name] && this.sampler(part.textures[name], name));
+      part.stencil = part.opacity?.wrap && this.sampler(part.opacity, "opacity");
     }
     this.sampling = TEXTURES.map(() => this.unit++);
     for (const program of [this.programs.vertex, this.programs.pixel]) {
@@ -118,7 +123,7 @@ export class Piece {
   }
   close() {
     const { gl } = this;
-    for (const part of this.content.parts) for (const handle of part.samplers) if (handle) gl.deleteTexture(handle);
+    for (const part of this.content.parts) for (const handle of [...part.samplers, part.stencil]) if (handle) gl.deleteTexture(handle);
     for (const { handle, frame } of Object.values(this.textures)) { gl.deleteTexture(handle); if (frame) gl.deleteFramebuffer(frame); }
     for (const program of Object.values(this.programs)) gl.deleteProgram(program);
     gl.deleteVertexArray(this.empty);
@@ -405,6 +410,18 @@ export class Piece {
     });
     part.written = key;
   }
+}
+
+// Runs of corners of faces: of a part with holes or of translucent material, or of any others.
+function runs(parts, face) {
+  const clear = parts.filter((part) => part.opacity), result = [];
+  const of = (vertex) => clear.find(({ first, count }) => vertex >= first && vertex < first + count) ?? null;
+  for (let i = 0; i < face.length; i += 3) {
+    const part = clear.length ? of(face[i]) : null, last = result.at(-1);
+    if (last && last.part === part) last.count += 3;
+    else result.push({ part, first: i, count: 3 });
+  }
+  return result;
 }
 
 // Means of visibility at all scales, from the bits of texels: see `pyramid` in jaxprt/systems/lobe/pyramid.py. A byte has

@@ -1,29 +1,48 @@
 // Shades the pixels of a picture on the GPU: first which triangle each pixel shows, then its light, part by part.
+// Translucent surfaces are shaded before it, layer by layer from the eye on, and each hides its share of what follows.
 
 import { clamp, floats } from "./common.js";
 import { WHOLE, WIDTH } from "./shading.js";
 
 const RASTER = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
-uniform usampler2D faces; uniform sampler2D place; uniform mat4 matrix; flat out uvec3 triangle; out vec2 part;
+uniform usampler2D faces; uniform sampler2D place, opacities; uniform mat4 matrix; flat out uvec3 triangle; out vec2 part; out vec3 clear;
 ivec2 at(int i) { return ivec2(i & ${WIDTH - 1}, i >> 12); }
 void main() {
   int corner = gl_VertexID % 3;
   triangle = texelFetch(faces, at(gl_VertexID / 3), 0).rgb;
   part = vec2(corner == 0, corner == 1);
+  clear = texelFetch(opacities, at(int(triangle[corner])), 0).xyz;
   gl_Position = matrix * vec4(texelFetch(place, at(2 * int(triangle[corner])), 0).xyz, 1);
 }`;
 const TRIANGLE = `#version 300 es
-precision highp float; precision highp int; flat in uvec3 triangle; in vec2 part; out uvec4 o;
-void main() { o = gl_FrontFacing ? uvec4(triangle, packUnorm2x16(part)) : uvec4(0xfffffffeu, 0u, 0u, 0u); }`;
+precision highp float; precision highp int; precision highp sampler2D; flat in uvec3 triangle; in vec2 part; in vec3 clear; out uvec4 o;
+uniform sampler2D stencil, solid, before; uniform bool holes, imaged, peeled; uniform float cutoff;
+void main() {
+  float opacity = 1.;
+  if (holes) {
+    opacity = clear.z * (imaged ? textureLod(stencil, vec2(clear.x, 1. - clear.y), 0.).r : 1.);
+    ivec2 here = ivec2(gl_FragCoord.xy);
+    if (cutoff >= 0.) {
+      if (opacity < cutoff) discard;
+      opacity = 1.;
+    } else if (opacity < ${1 / 512} || gl_FragCoord.z >= texelFetch(solid, here, 0).r || (peeled && gl_FragCoord.z <= texelFetch(before, here, 0).r)) discard;
+  }
+  uint hides = uint(255. * opacity + .5) << 24;
+  o = gl_FrontFacing ? uvec4(triangle.x | hides, triangle.yz, packUnorm2x16(part)) : uvec4(0xfffffeu | hides, 0u, 0u, 0u);
+}`;
 const BARE = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D; uniform usampler2D shown; out vec4 o;
 void main() { // pixels without light: backs are black, and the others show the sky
-  uint vertex = texelFetch(shown, ivec2(gl_FragCoord.xy), 0).r;
-  if (vertex < 0xfffffffeu) discard;
-  o = vec4(0, 0, 0, vertex == 0xfffffffeu);
+  uint both = texelFetch(shown, ivec2(gl_FragCoord.xy), 0).r, vertex = both & 0xffffffu;
+  if (vertex < 0xfffffeu) discard;
+  o = vec4(0, 0, 0, vertex == 0xfffffeu ? float(both >> 24) / 255. : 0.);
 }`;
+const COPY = `#version 300 es
+precision highp float; uniform sampler2D image; out vec4 o;
+void main() { o = texelFetch(image, ivec2(gl_FragCoord.xy), 0); }`;
 const EMPTY = Uint32Array.of(0xffffffff, 0, 0, 0);
+const LAYERS = 4; // translucent surfaces that a pixel shows
 
 const PIXEL_EDGES = [0, 4, 2, 1]; // while something moves: colors at vertices, or edges of pixels
 const SLUGGISH = 45, BRISK = 22; // milliseconds of a frame from which on there are fewer pixels, and up to which more are tried
@@ -47,11 +66,10 @@ export class Pixels {
     piece.build(gl);
     this.raster = piece.link(RASTER, TRIANGLE);
     this.rest = piece.link(WHOLE, BARE);
-    this.unit = piece.unit++;
-    for (const program of [this.rest, piece.programs.pixel]) {
-      gl.useProgram(program);
-      gl.uniform1i(piece.at("shown", program), this.unit);
-    }
+    this.copy = piece.link(WHOLE, COPY);
+    [this.unit, this.layerUnit, this.solidUnit, this.beforeUnit, this.stencilUnit] = [0, 0, 0, 0, 0].map(() => piece.unit++);
+    gl.useProgram(this.raster);
+    piece.ints(this.raster, { solid: this.solidUnit, before: this.beforeUnit, stencil: this.stencilUnit });
     this.floats = floats(gl);
     this.images = {};
     this.triangles = null;
@@ -74,15 +92,17 @@ export class Pixels {
     this.release();
     gl.deleteProgram(this.raster);
     gl.deleteProgram(this.rest);
+    gl.deleteProgram(this.copy);
     if (this.fence) gl.deleteSync(this.fence.sync);
     piece.close();
   }
   release() {
     const { gl, triangles } = this;
     if (!triangles) return;
-    gl.deleteTexture(triangles.handle);
-    gl.deleteRenderbuffer(triangles.depth);
-    gl.deleteFramebuffer(triangles.frame);
+    for (const { handle, depths, frames } of triangles.sets) {
+      for (const texture of [handle, ...depths]) gl.deleteTexture(texture);
+      for (const frame of frames) gl.deleteFramebuffer(frame);
+    }
     this.triangles = null;
   }
   // Whether frames take long even with colors at vertices.
@@ -127,7 +147,7 @@ export class Pixels {
   // Gives the GPU the work of a frame. True if there is more to do.
   work(now, matrix, width, height, python) {
     this.fresh = false; // whether more is seen after it
-    this.least = this.floats && this.piece.count > (width * height) / 4 ? 1 : 0; // pixels may be fewer than vertices
+    this.least = this.floats && (this.piece.opacities.length || this.piece.count > (width * height) / 4) ? 1 : 0; // vertices show no holes, and may be more than pixels
     this.level = this.floats ? Math.max(this.level, this.least) : 0;
     if (this.stale) {
       this.stale = false;
@@ -219,57 +239,137 @@ export class Pixels {
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, handle, 0);
     return (this.images[name] = { handle, frame, width, height });
   }
-  // The vertices of the triangle that each pixel shows, and where the pixel lies between them.
-  find(matrix, columns, rows, width, height) {
-    const { gl, piece } = this;
-    if (this.triangles?.width !== width || this.triangles.height !== height) {
-      this.release();
-      const handle = gl.createTexture(), frame = gl.createFramebuffer(), depth = gl.createRenderbuffer();
-      gl.activeTexture(gl.TEXTURE0 + this.unit);
+  // Textures of triangles with depths of their own, of which one is drawn to while another one is read.
+  found(width, height, unit, depthUnits) {
+    const { gl } = this, texture = (form, to) => {
+      const handle = gl.createTexture();
+      gl.activeTexture(gl.TEXTURE0 + to);
       gl.bindTexture(gl.TEXTURE_2D, handle);
-      gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, width, height);
+      gl.texStorage2D(gl.TEXTURE_2D, 1, form, width, height);
       for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
-      gl.bindRenderbuffer(gl.RENDERBUFFER, depth);
-      gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, height);
+      return handle;
+    };
+    const handle = texture(gl.RGBA32UI, unit), depths = depthUnits.map((to) => texture(gl.DEPTH_COMPONENT32F, to));
+    const frames = depths.map((depth) => {
+      const frame = gl.createFramebuffer();
       gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
       gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, handle, 0);
-      gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, depth);
-      this.triangles = { handle, frame, depth, width, height };
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.TEXTURE_2D, depth, 0);
+      return frame;
+    });
+    return { handle, depths, frames };
+  }
+  // The vertices of the triangle that each pixel shows, and where the pixel lies between them.
+  find(matrix, columns, rows, width, height) {
+    if (this.triangles?.width !== width || this.triangles.height !== height) {
+      this.release();
+      const sets = [this.found(width, height, this.unit, [this.solidUnit])];
+      if (this.piece.blends) sets.push(this.found(width, height, this.layerUnit, [this.beforeUnit, this.beforeUnit]));
+      this.triangles = { sets, width, height };
     }
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.triangles.frame);
+    const { gl } = this, [{ frames, depths }] = this.triangles.sets, bind = (texture) => {
+      gl.activeTexture(gl.TEXTURE0 + this.solidUnit);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+    };
+    bind(null); // what is drawn to must not be read
+    this.trace(frames[0], matrix, columns, rows, false);
+    bind(depths[0]);
+  }
+  // Draws the triangles of solid parts, or those of translucent ones.
+  trace(frame, matrix, columns, rows, blending) {
+    const { gl, piece } = this, { raster } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
     gl.viewport(0, 0, columns, rows);
     gl.clearBufferuiv(gl.COLOR, 0, EMPTY);
     gl.clear(gl.DEPTH_BUFFER_BIT);
-    gl.useProgram(this.raster);
+    gl.useProgram(raster);
     gl.bindVertexArray(piece.empty);
-    gl.uniformMatrix4fv(piece.at("matrix", this.raster), false, matrix);
-    drawSides(gl, this.backs, piece.face.length, (vertices) => gl.drawArrays(gl.TRIANGLES, 0, vertices));
+    gl.uniformMatrix4fv(piece.at("matrix", raster), false, matrix);
+    drawSides(gl, this.backs, piece.face.length, (vertices) => {
+      for (const { part, first, count } of piece.runs) {
+        if (first >= vertices || (part?.opacity.cutoff < 0) !== blending) continue;
+        piece.ints(raster, { holes: part ? 1 : 0, imaged: part?.stencil ? 1 : 0 });
+        if (part) gl.uniform1f(piece.at("cutoff", raster), part.opacity.cutoff);
+        if (part?.stencil) {
+          gl.activeTexture(gl.TEXTURE0 + this.stencilUnit);
+          gl.bindTexture(gl.TEXTURE_2D, part.stencil);
+        }
+        gl.drawArrays(gl.TRIANGLES, first, Math.min(count, vertices - first));
+      }
+    });
   }
   // Shades rows of an image; `weight` is what the new colors count beside the old ones.
   shade(image, matrix, row, rows, weight) {
-    const { gl, piece } = this, { width, height } = image;
-    gl.bindFramebuffer(gl.FRAMEBUFFER, image.frame);
-    gl.viewport(0, 0, width, height);
+    const { gl, piece } = this;
     gl.bindVertexArray(piece.empty);
     gl.enable(gl.SCISSOR_TEST);
-    gl.scissor(0, row, width, rows);
+    const layers = piece.blends && this.layers(image, matrix, row, rows);
+    this.on(image, row, rows);
     if (weight < 1) {
       gl.enable(gl.BLEND);
       gl.blendColor(0, 0, 0, weight);
       gl.blendFunc(gl.CONSTANT_ALPHA, gl.ONE_MINUS_CONSTANT_ALPHA);
     }
+    if (layers) {
+      gl.useProgram(this.copy);
+      gl.activeTexture(gl.TEXTURE0);
+      gl.bindTexture(gl.TEXTURE_2D, layers.handle);
+      gl.uniform1i(piece.at("image", this.copy), 0);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    } else this.surfaces(image, matrix, row, rows, this.unit, false);
+    gl.disable(gl.BLEND);
+    piece.finish();
+  }
+  // Rows of translucent surfaces from the eye on, and of what is solid behind them, in an image of their own.
+  layers({ width, height }, matrix, row, rows) {
+    const { gl } = this, image = this.image("layers", width, height), surfaces = (unit, blending) => {
+      this.on(image, row, rows);
+      gl.enable(gl.BLEND);
+      gl.blendFunc(gl.ONE_MINUS_DST_ALPHA, gl.ONE);
+      this.surfaces(image, matrix, row, rows, unit, blending);
+      gl.disable(gl.BLEND);
+    };
+    this.on(image, row, rows);
+    gl.clearBufferfv(gl.COLOR, 0, new Float32Array(4));
+    for (let layer = 0; layer < LAYERS; layer++) {
+      gl.scissor(0, row, width, rows);
+      this.peel(layer, matrix, width, height);
+      surfaces(this.layerUnit, true);
+    }
+    surfaces(this.unit, false);
+    return image;
+  }
+  on({ frame, width, height }, row, rows) {
+    const { gl } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+    gl.viewport(0, 0, width, height);
+    gl.scissor(0, row, width, rows);
+  }
+  // The next translucent surfaces from the eye on: behind the last ones, and before all that is solid.
+  peel(layer, matrix, columns, rows) {
+    const { gl, piece } = this, { frames, depths } = this.triangles.sets[1], now = layer % 2;
+    gl.activeTexture(gl.TEXTURE0 + this.beforeUnit);
+    gl.bindTexture(gl.TEXTURE_2D, depths[1 - now]);
+    gl.useProgram(this.raster);
+    gl.uniform1i(piece.at("peeled", this.raster), layer > 0 ? 1 : 0);
+    this.trace(frames[now], matrix, columns, rows, true);
+  }
+  // Shades what `shown` has: backs and the sky first, then the solid parts or the translucent ones.
+  surfaces({ width, height }, matrix, row, rows, shown, blending) {
+    const { gl, piece } = this, { pixel } = piece.programs;
     gl.useProgram(this.rest);
+    gl.uniform1i(piece.at("shown", this.rest), shown);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
-    gl.useProgram(piece.programs.pixel);
-    piece.shade(piece.programs.pixel, this.message, (part) => {
+    gl.useProgram(pixel);
+    gl.uniform1i(piece.at("shown", pixel), shown);
+    piece.shade(pixel, this.message, (part) => {
+      if ((part.opacity?.cutoff < 0) !== blending) return;
       const [left, low, right, high] = bounds(this.boxes[piece.content.parts.indexOf(part)], matrix, width, height);
       const [from, to] = [Math.max(low, row), Math.min(high, row + rows)];
       if (left >= right || from >= to) return;
       gl.scissor(left, from, right - left, to - from);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     });
-    gl.disable(gl.BLEND);
-    piece.finish();
   }
   // Colors and coverage of the picture at rest, from its lowest row.
   read() {

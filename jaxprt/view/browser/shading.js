@@ -235,9 +235,10 @@ vec4 coordinate = vec4(0), toRight = vec4(0), toTop = vec4(0);
 bool coordinateOf(ivec2 pixel, out vec4 result) {
   uvec4 triangle = texelFetch(shown, pixel, 0);
   result = vec4(0);
-  if (int(triangle.x) < first || int(triangle.x) >= first + count) return false;
+  int vertex = int(triangle.x & 0xffffffu);
+  if (vertex < first || vertex >= first + count) return false;
   vec2 part = unpackUnorm2x16(triangle.w);
-  result = part.x * texelFetch(coordinates, at(int(triangle.x)), 0) + part.y * texelFetch(coordinates, at(int(triangle.y)), 0) + (1. - part.x - part.y) * texelFetch(coordinates, at(int(triangle.z)), 0);
+  result = part.x * texelFetch(coordinates, at(vertex), 0) + part.y * texelFetch(coordinates, at(int(triangle.y)), 0) + (1. - part.x - part.y) * texelFetch(coordinates, at(int(triangle.z)), 0);
   return true;
 }
 vec4 change(ivec2 step) { // the smaller one to both sides, as the other may cross a seam
@@ -371,9 +372,9 @@ void main() {
 }
 #else
 out vec4 o;
-void main() { // of a texture with the vertices of the triangle at each pixel, and two barycentric coordinates
+void main() { // of a texture with the vertices of the triangle at each pixel, its opacity, and two barycentric coordinates
   uvec4 triangle = texelFetch(shown, ivec2(gl_FragCoord.xy), 0);
-  corner[0] = int(triangle.x) - first;
+  corner[0] = int(triangle.x & 0xffffffu) - first;
   if (corner[0] < 0 || corner[0] >= count) discard;
   corner[1] = int(triangle.y) - first;
   corner[2] = int(triangle.z) - first;
@@ -387,7 +388,8 @@ void main() { // of a texture with the vertices of the triangle at each pixel, a
     normal += share[k] * normalAt(first + corner[k]);
   }
   normal = dot(normal, normal) > 1e-12 ? normalize(normal) : normalAt(first + corner[0]);
-  o = vec4(shade(), 1);
+  float opacity = float(triangle.x >> 24) / 255.;
+  o = vec4(opacity * shade(), opacity);
 }
 #endif`;
 // The irradiance of vertices / pi, by transfer vectors, and what bounces and lamps add: made once for a light.
