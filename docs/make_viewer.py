@@ -1,4 +1,4 @@
-"""Makes pictures/viewer.gif: plays the viewer in headless Chromium, `python docs/make_viewer.py`.
+"""Makes pictures/viewer.webp: plays the viewer in headless Chromium, `python docs/make_viewer.py`.
 
 Each frame is shown for a fixed share of what the viewer took for it, from the gesture to the picture, on the machine
 that ran it. `SPEED` says how much faster that is, and README names it beside the picture.
@@ -20,13 +20,13 @@ from playwright.sync_api import Page, sync_playwright
 import jaxprt as prt
 from jaxprt.scene import builtin
 
-PICTURE = pathlib.Path(__file__).parents[1] / "pictures" / "viewer.gif"
+PICTURE = pathlib.Path(__file__).parents[1] / "pictures" / "viewer.webp"
 SIZE = (640, 400)
 SHOWN = (960, 600)  # the page, which is drawn larger and then reduced
 MOST_BYTES = 2_500_000
 SPEED = 6  # frames are shown so many times as fast as they were made
 LEAST, RESTING = 40, 1200  # milliseconds that a frame is shown at least, and that a picture at rest is
-COLORS = 128
+QUALITY = 82  # of the frames, which keep their own colors
 _SWITCHES = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 _ROOT = "document.querySelector('#viewer').shadowRoot"
 
@@ -94,8 +94,9 @@ def play(page: Page) -> Film:
     """Orbits, turns the light by its slider, and drags the metal to a plastic and through roughness and reflectance."""
     film = Film(page)
     film.settle()
+    page.get_by_label("tone curve", exact=True).select_option(label="agx")
     page.get_by_text("View", exact=True).click()  # folds what the film does not use
-    film.take(RESTING)
+    film.rest()
     middle = (SHOWN[0] * 0.35, SHOWN[1] * 0.55)
     film.drag(middle, [(middle[0] + 9 * k, middle[1] + 30 * math.sin(k / 4)) for k in range(1, 11)])
     film.rest()
@@ -124,15 +125,10 @@ def play(page: Page) -> Film:
 
 
 def write(frames: list[Image.Image], milliseconds: list[float]) -> int:
-    """Writes the frames with one palette for all; the number of bytes."""
-    sheet = Image.new("RGB", (SIZE[0], SIZE[1] * 3))
-    for row, number in enumerate((0, len(frames) // 2, len(frames) - 1)):
-        sheet.paste(frames[number], (0, row * SIZE[1]))
-    palette = sheet.quantize(COLORS)
-    reduced = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in frames]
-    lasting = [10 * round(each / 10) for each in milliseconds]  # the unit of the format is 10 ms
-    reduced[0].save(
-        PICTURE, save_all=True, append_images=reduced[1:], duration=lasting, loop=0, optimize=True, disposal=1
+    """Writes the frames; the number of bytes."""
+    lasting = [round(each) for each in milliseconds]
+    frames[0].save(
+        PICTURE, save_all=True, append_images=frames[1:], duration=lasting, loop=0, quality=QUALITY, method=6
     )
     return PICTURE.stat().st_size
 

@@ -31,6 +31,7 @@ _STARTS = ("first", "weightStart", "pyramidStart", "visibleStart", "arrivedStart
 _TERMS = {standard.BLINN_PHONG: [3, 4], standard.COOK_TORRANCE: [3, 5, 6]}
 _LIGHT = 32  # most texels along the edge of the faces of the light that lobes read without visibility
 _IMAGE = 512  # most texels along an edge of an image
+_STENCIL = 2048  # of the opacity of a surface, whose holes may be as fine as a texel
 _IMAGES = ("base_color", "roughness", "metallic", "emissive", "normal")  # textures that pages read at pixels
 _COLORED = ("base_color", "emissive")  # of these, those that are encoded by sRGB
 _SKY = 64  # most texels along the edge of a light's faces
@@ -90,7 +91,7 @@ def scene_content(page: PageScene) -> tuple[JsonObject, list[bytes]]:
         about |= {"nodes": table.shape[1], "entries": table.shape[2], "terms": -(-len(held.vector) // 4) * 4}
         about |= {"weightStep": 0 if described else weight.shape[1], **(described or {})}
         if opacity is not None and opacity.layer[place["first"]]:
-            about["opacity"] = _opacity_json(opacity, int(opacity.layer[place["first"]]), images)
+            about["opacity"] = images.opacity(opacity, int(opacity.layer[place["first"]]))
         parts.append(about | place | {"tableStart": start})
         weight = weight[:1] if described else weight
         vector = _bytes(held.vector, unit, terms)
@@ -181,40 +182,41 @@ class _Images:
         colored, normal = name in _COLORED, name == "normal"
         key = id(texture.image), "color" if colored else "normal" if normal else "value"
         if key not in self._number:
-            value = np.clip(_halved(np.asarray(unit_normals(texture.image) if normal else texture.image)), 0, 1)
+            value = unit_normals(texture.image) if normal else texture.image
+            value = np.clip(_halved(np.asarray(value), most=_IMAGE), 0, 1)
             if colored:
                 value = np.broadcast_to(value, (*value.shape[:2], 3))
                 value = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
             # Normals are 127 (normal + 1), so that their zeros and ones are exact.
-            self._number[key] = self.append((254 if normal else 255) * value)
+            self._append(key, (254 if normal else 255) * value)
         how = {"transform": np.asarray(texture.transform, float).tolist(), "set": texture.set, "wrap": texture.wrap}
         return {"image": self._number[key], **how}
 
-    def append(self, value: Float[np.ndarray, "h w c"]) -> int:
-        """The number of a new image of bytes."""
+    def opacity(self, opacity: Opacity, layer: int) -> JsonObject:
+        """Where a part with holes or of translucent material is there, and how it reads the image of its opacity."""
+        about: JsonObject = {"cutoff": float(opacity.cutoff[layer]), "glass": bool(opacity.glass[layer])}
+        start, (height, width) = int(opacity.start[layer]), opacity.shape[layer]
+        if start < 0:
+            return about
+        key = start, "opacity"
+        if key not in self._number:
+            image = np.asarray(opacity.texel[start : start + height * width]).reshape(height, width, 1)
+            self._append(key, 255 * np.clip(_halved(image, most=_STENCIL), 0, 1))
+        return about | {"image": self._number[key], "wrap": [WRAPS[number] for number in opacity.wrap[layer]]}
+
+    def _append(self, key: tuple[int, str], value: Float[np.ndarray, "h w c"]) -> None:
         height, width, channels = value.shape
+        self._number[key] = len(self.data)
         self.described.append({"width": width, "height": height, "channels": channels})
         self.data.append(np.round(value).astype(np.uint8))
-        return len(self.data) - 1
 
 
-def _halved(value: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "_ _ c"]:
-    """An image with half as many rows and columns, as often as it has more than pages take."""
+def _halved(value: Float[np.ndarray, "h w c"], *, most: int) -> Float[np.ndarray, "_ _ c"]:
+    """An image with half as many rows and columns, as often as an edge has more texels than `most`."""
     value = np.asarray(value, np.float64)
-    while max(value.shape[:2]) > _IMAGE and not (value.shape[0] % 2 or value.shape[1] % 2):
+    while max(value.shape[:2]) > most and not (value.shape[0] % 2 or value.shape[1] % 2):
         value = value.reshape(value.shape[0] // 2, 2, value.shape[1] // 2, 2, -1).mean((1, 3))
     return value
-
-
-def _opacity_json(opacity: Opacity, layer: int, images: _Images) -> JsonObject:
-    """Where a part with holes or of translucent material is there, and the image that multiplies its opacity."""
-    about: JsonObject = {"cutoff": float(opacity.cutoff[layer])}
-    start, (height, width) = int(opacity.start[layer]), opacity.shape[layer]
-    if start < 0:
-        return about
-    image = np.asarray(opacity.texel[start : start + height * width]).reshape(height, width, 1)
-    wrap = [WRAPS[number] for number in opacity.wrap[layer]]
-    return about | {"image": images.append(255 * _halved(image)), "wrap": wrap}
 
 
 def _bytes(value: Float[np.ndarray, "k v"], unit: Float[np.ndarray, " m"], length: int) -> Float[np.ndarray, "v l"]:
@@ -298,6 +300,8 @@ def _material_json(part: Part, shading: Shading, images: _Images) -> JsonObject 
     if isinstance(material, CookTorrance) and shading.table == standard.COOK_TORRANCE:
         return {"material": _colors(material, "diffuse", "specular", "f0") | {"slope": float(material.roughness)}}
     if not isinstance(material, TexturedMaterial) or shading.scale is None or part.color is not None:
+        return None
+    if float(material.transmission) > 0:  # whose diffuse light is less
         return None
     names = ("base_color", "metallic", "specular", "specular_color", "ior", "roughness", "emissive", "normal_scale")
     values: JsonObject = {name: np.asarray(getattr(material, name), float).tolist() for name in names}

@@ -232,6 +232,7 @@ class Session:
             "picture": self._picture,
             "sky": self._sky,
             "drop": self._drop,
+            "lights": self._lights,
             "page": self._page,
             "progress": self._progress,
         }
@@ -282,7 +283,7 @@ class Session:
         # A page says how large its pictures are, so that their programs can be compiled ahead.
         if "width" in message:
             self._size = _size(message)[:2]
-        lights = 0 if self._version is None else len(self.stages.lights)
+        lights = 0 if self._version is None else len(self.stages.name)
         return Reply(self.progress.content() | {"version": self.version, "lights": lights}, [])
 
     def _scene(self, message: Message, buffers: Sequence[bytes]) -> Reply:
@@ -444,9 +445,16 @@ class Session:
         with self._lock:
             self.stages.lights.append(light)
             self.stages.name.append(file.stem)
-            texels = light_texels(light, mip_edges(self.stages.size)[0])
-            content = {"kind": "lights", "lights": list(self.stages.name), "light": len(self.stages.name) - 1}
-            return Reply(content, [texels])
+            first = len(self.stages.name) - 1
+        return self._lights({"first": first}, [])
+
+    def _lights(self, message: Message, buffers: Sequence[bytes]) -> Reply:
+        """Names of all lights, and texels of those from a number on, `light`."""
+        with self._lock:
+            names, lights = list(self.stages.name), list(self.stages.lights)
+        first, edge = int(messages.number(message, "first", 0.0, float(len(names)))), mip_edges(self.stages.size)[0]
+        content = {"kind": "lights", "lights": names, "light": first}
+        return Reply(content, [light_texels(light, edge) for light in lights[first : len(names)]])
 
     def _between(self, message: Message, seq: int, shown: Stages) -> Callable[[], None]:
         """A function to call between the steps of a picture. It raises if there is a newer look or a better scene."""

@@ -308,6 +308,10 @@ def test_a_dropped_file_becomes_a_light(session, look, tmp_path):
     assert reply.content == {"kind": "lights", "lights": ["lamp", "gray", "gray"], "light": 2}
     np.testing.assert_allclose(np.frombuffer(reply.buffers[0], "<f4"), np.full(6 * 8 * 8 * 3, 0.25), rtol=1e-5)
     near(halves(session.answer(look | {"light": 2})) * 2, halves(session.answer(look | {"light": 1})))
+    other = session.answer({"kind": "lights", "first": 1})
+    assert other.content == reply.content | {"light": 1}
+    assert other.buffers[1:] == reply.buffers
+    assert "first must be from 0 to 3, got 4" in session.answer({"kind": "lights", "first": 4}).content["message"]
 
 
 HEADER = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n"

@@ -271,9 +271,11 @@ export class Drawing {
   // the 99th percentile of luminance over pixels that surfaces fill is 0.9. Bytes hold it once it is neither white nor
   // black. Null where no surface is seen, or all is black.
   exposure(camera, state, center) {
-    const height = 96, width = Math.max(1, Math.round((height * this.canvas.width) / this.canvas.height));
+    const { gpu } = this, height = 96, width = Math.max(1, Math.round((height * this.canvas.width) / this.canvas.height));
+    // Vertices show no holes, and nothing behind what is translucent.
+    const image = gpu?.piece.opacities.length ? gpu.glance(camera.matrix(width / height, center), width, height) : null;
     for (let stops = 0, tries = 0; tries < 12; tries++) {
-      const pixel = this.pixels(camera, { ...state, stops, tone: TONES[0], background: false }, center, { width, height }), lit = [];
+      const pixel = this.pixels(camera, { ...state, stops, tone: TONES[0], background: false }, center, { width, height }, image), lit = [];
       for (let i = 0; i < pixel.length; i += 4) {
         if (pixel[i + 3] < 255) continue;
         const [r, g, b] = [0, 1, 2].map((c) => toLinear(pixel[i + c] / 255)), luminance = 0.2126 * r + 0.7152 * g + 0.0722 * b;

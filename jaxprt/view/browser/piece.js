@@ -33,7 +33,7 @@ export class Piece {
     this.index = new Map(content.rims.map((edge) => [edge, next(Uint32Array)]));
     this.lights = Array.from({ length: content.lights }, () => next(Float32Array));
     this.count = this.position.length / 3;
-    this.runs = runs(content.parts, this.face);
+    this.runs = runs(content.parts, this.face, this.count);
     this.blends = content.parts.some((part) => part.opacity?.cutoff < 0);
   }
   // Means of visibility, where only bits were sent: to await before `build`.
@@ -313,7 +313,7 @@ export class Piece {
       for (const name of ["first", "count", "lobes", "channels", "nodes", "tableStart", "weightStart", "pyramidStart", "bands", "entries", "arrivedStart"]) gl.uniform1i(this.at(name, program), part[name]);
       gl.uniform1f(this.at("steps", program), part.steps);
       gl.uniform1f(this.at("logRoughness", program), log);
-      this.ints(program, { texels: part.texels ? this.texels : 0, weightStep, families: part.family.terms.length, knots: Math.max(part.knot.length, 1) });
+      this.ints(program, { glass: part.opacity?.glass ? 1 : 0, texels: part.texels ? this.texels : 0, weightStep, families: part.family.terms.length, knots: Math.max(part.knot.length, 1) });
       if (part.family.terms.length) {
         gl.uniform1iv(this.at("term", program), part.family.terms);
         gl.uniform1fv(this.at("scale", program), part.family.scale);
@@ -413,11 +413,11 @@ export class Piece {
 }
 
 // Runs of corners of faces: of a part with holes or of translucent material, or of any others.
-function runs(parts, face) {
-  const clear = parts.filter((part) => part.opacity), result = [];
-  const of = (vertex) => clear.find(({ first, count }) => vertex >= first && vertex < first + count) ?? null;
+function runs(parts, face, vertices) {
+  const number = new Int32Array(vertices).fill(-1), result = [];
+  parts.forEach((part, i) => { if (part.opacity) number.fill(i, part.first, part.first + part.count); });
   for (let i = 0; i < face.length; i += 3) {
-    const part = clear.length ? of(face[i]) : null, last = result.at(-1);
+    const part = parts[number[face[i]]] ?? null, last = result.at(-1);
     if (last && last.part === part) last.count += 3;
     else result.push({ part, first: i, count: 3 });
   }

@@ -43,6 +43,7 @@ precision highp float; uniform sampler2D image; out vec4 o;
 void main() { o = texelFetch(image, ivec2(gl_FragCoord.xy), 0); }`;
 const EMPTY = Uint32Array.of(0xffffffff, 0, 0, 0);
 const LAYERS = 4; // translucent surfaces that a pixel shows
+const STRIPS = 8; // of a picture with layers, at most
 
 const PIXEL_EDGES = [0, 4, 2, 1]; // while something moves: colors at vertices, or edges of pixels
 const SLUGGISH = 45, BRISK = 22; // milliseconds of a frame from which on there are fewer pixels, and up to which more are tried
@@ -54,7 +55,7 @@ const JITTER = [[0, 0], [1, -3], [-1, 3], [5, 1], [-3, -5], [-5, 5], [-7, -1], [
 export class Pixels {
   constructor(gl, piece, backs) { // of faces after the first `backs` no backs are seen
     Object.assign(this, { gl, piece, backs });
-    this.level = 1; // of PIXEL_EDGES
+    [this.level, this.least] = [1, 0]; // of PIXEL_EDGES
     this.trial = PIXEL_EDGES.map(() => ({ after: 0, pause: 2000 })); // when a finer level may be tried again
     this.quick = 0; // quick frames one after another
     this.strip = 1 << 14; // pixels at rest that are shaded in one call
@@ -105,8 +106,8 @@ export class Pixels {
     }
     this.triangles = null;
   }
-  // Whether frames take long even with colors at vertices.
-  get slow() { return !this.patient && this.used.has(0) && this.level === 0 && this.stats.ms > 2 * SLUGGISH; }
+  // Whether frames take long even where they are coarsest.
+  get slow() { return !this.patient && this.level <= this.least && this.used.has(this.level) && this.stats.ms > 2 * SLUGGISH; }
   // The picture has changed: its light, view, materials or size.
   change(message) {
     this.message = message;
@@ -183,7 +184,7 @@ export class Pixels {
     this.piece.shine(this.message);
     const moved = jittered(matrix, JITTER[this.sample], width, height);
     if (!this.row) this.find(moved, width, height, width, height);
-    const image = this.image("rest", width, height), rows = clamp(Math.floor(this.strip / width), 1, height - this.row);
+    const image = this.image("rest", width, height), rows = this.rows(this.row, width, height);
     this.shade(image, moved, this.row, rows, 1 / (this.sample + 1));
     this.row += rows;
     this.fresh = this.row >= height;
@@ -193,6 +194,20 @@ export class Pixels {
       this.shown = image;
     }
     this.sent(false);
+  }
+  // Rows of the next strip. Each has layers of its own, whatever its height, so that with layers there are few.
+  rows(row, width, height) {
+    return clamp(Math.floor(this.strip / width), this.piece.blends ? Math.min(Math.ceil(height / STRIPS), height - row) : 1, height - row);
+  }
+  // A small picture with one sample, at once; null while another one of its own size is made.
+  glance(matrix, width, height) {
+    if (!this.floats || this.held) return null;
+    this.piece.shine(this.message);
+    this.find(matrix, width, height, width, height);
+    const image = this.image("glance", width, height);
+    this.shade(image, matrix, 0, height, 1);
+    this.stale = true; // the triangles of frames are lost
+    return image;
   }
   // A picture of a size of its own, as at rest. Frames wait for it. `dispose` is to be called once it has been read.
   async whole(matrix, width, height) {
@@ -207,7 +222,7 @@ export class Pixels {
         if (gl.getError() === gl.OUT_OF_MEMORY) throw new Error(`this browser's GPU has no memory for ${width} x ${height} pixels`);
         const image = this.image("saved", width, height);
         for (let row = 0, rows; row < height; row += rows) {
-          rows = clamp(Math.floor(this.strip / width), 1, height - row);
+          rows = this.rows(row, width, height);
           this.shade(image, moved, row, rows, 1 / (sample + 1));
           this.sent(false);
           while (this.working) await new Promise(requestAnimationFrame);
@@ -332,7 +347,7 @@ export class Pixels {
     this.on(image, row, rows);
     gl.clearBufferfv(gl.COLOR, 0, new Float32Array(4));
     for (let layer = 0; layer < LAYERS; layer++) {
-      gl.scissor(0, row, width, rows);
+      gl.scissor(0, row - 1, width, rows + 2); // textures are read by what is beside a pixel
       this.peel(layer, matrix, width, height);
       surfaces(this.layerUnit, true);
     }

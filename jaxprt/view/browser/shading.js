@@ -38,6 +38,7 @@ uniform sampler2D coordinates, base_colorImage, roughnessImage, metallicImage, e
 uniform int sampled, sets[5]; // which textures there are, and the coordinates and transform of each
 uniform vec3 across[5], upward[5], baseColor, f0, emissive; uniform vec4 factors; // specular, metallic, roughness
 uniform float slope; // of the normal map
+uniform bool glass; // which hides a share of what is behind it, and none of what it reflects itself
 ${AT} ${CUBE} ${BRIGHT}
 int corner[CORNERS]; // vertices of the part, and how much each counts
 float share[CORNERS];
@@ -389,7 +390,7 @@ void main() { // of a texture with the vertices of the triangle at each pixel, i
   }
   normal = dot(normal, normal) > 1e-12 ? normalize(normal) : normalAt(first + corner[0]);
   float opacity = float(triangle.x >> 24) / 255.;
-  o = vec4(opacity * shade(), opacity);
+  o = vec4((glass ? 1. : opacity) * shade(), opacity);
 }
 #endif`;
 // The irradiance of vertices / pi, by transfer vectors, and what bounces and lamps add: made once for a light.

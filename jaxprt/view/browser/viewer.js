@@ -250,14 +250,17 @@ export function mount(root, ask) {
     controls?.show();
     if (long) moved(); else redraw();
   };
+  const took = ({ lights, light }, buffers) => { // texels of the last ones, from a number on
+    scene.lights = lights;
+    if (gpu) buffers.forEach((each, i) => { gpu.piece.lights[light + i] = new Float32Array(each.buffer, each.byteOffset, each.byteLength / 4); });
+  };
   const drop = async (file) => {
     if (file.size > 2 ** 29) return tell(`${file.name} must have at most 512 MiB, and has ${Math.ceil(file.size / 2 ** 20)}`);
     try {
       const sent = ask({ kind: "drop", name: file.name }, [await file.arrayBuffer()]);
       const { content, buffers } = await waiting.during("drop", `reading ${file.name}`, sent, 0);
       if (content.kind === "error") { stats.errors++; return tell(content.message); }
-      scene.lights = content.lights;
-      if (gpu && buffers.length) gpu.piece.lights[content.light] = new Float32Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 4);
+      took(content, buffers);
       set({ light: content.light, lamps: [] });
     } catch (error) { stats.errors++; tell(`no answer from Python: ${error.message}`); }
   };
@@ -308,11 +311,20 @@ export function mount(root, ask) {
     if (content.kind === "error") return tell(content.message);
     if (content.error) tell(content.error);
     waiting.set("progress", content.finished ? "" : content.stage, content.fraction);
-    if (content.version > (scene?.version ?? 0) || (scene && content.lights > scene.lights.length)) load();
+    if (content.version > (scene?.version ?? 0)) load();
+    else if (scene && content.lights > scene.lights.length) more();
     else if (content.finished && bouncing) {
       bouncing = false;
       set({ bounces: true });
     }
+  };
+  // Names and texels of lights that the page does not have.
+  const more = async () => {
+    try {
+      const { content, buffers } = await ask({ kind: "lights", first: scene.lights.length });
+      if (!closed && content.kind === "lights") took(content, buffers);
+      controls?.show();
+    } catch { /* the next look tells */ }
   };
   // A light may have been dropped on another page of the same scene.
   const returned = async () => { try { heard((await ask({ kind: "progress" })).content); } catch { /* the next look tells */ } };
