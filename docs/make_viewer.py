@@ -52,7 +52,7 @@ class Film:
 
     def __init__(self, page: Page):
         """Starts with no frames."""
-        self.page, self.frames, self.milliseconds = page, [], []
+        self.page, self.frames, self.milliseconds, self.stills = page, [], [], 0
 
     def settle(self) -> None:
         """Waits until the newest look is shown."""
@@ -68,10 +68,13 @@ class Film:
 
     def rest(self) -> None:
         """Adds the picture at rest, once it has come: nothing has been drawn for two seconds."""
-        draws, before = f"() => {_ROOT}.querySelector('.canvas').stats.draws", -1
+        stats = f"{_ROOT}.querySelector('.canvas').stats"
+        self.page.wait_for_function(f"(known) => {stats}.stills > known", arg=self.stills)
+        draws, before = f"() => {stats}.draws", -1
         while before != (now := self.page.evaluate(draws)):
             before = now
             self.page.wait_for_timeout(2000)
+        self.stills = self.page.evaluate(f"() => {stats}.stills")
         self.take(RESTING)
 
     def drag(self, start: tuple[float, float], places: Sequence[tuple[float, float]]) -> None:
@@ -94,7 +97,7 @@ def play(page: Page) -> Film:
     """Orbits, turns the light by its slider, and drags the metal to a plastic and through roughness and reflectance."""
     film = Film(page)
     film.settle()
-    page.get_by_label("tone curve", exact=True).select_option(label="agx")
+    page.locator("select", has=page.locator("option", has_text="agx")).select_option(label="agx")
     page.get_by_text("View", exact=True).click()  # folds what the film does not use
     film.rest()
     middle = (SHOWN[0] * 0.35, SHOWN[1] * 0.55)
