@@ -301,9 +301,8 @@ def _material_json(part: Part, shading: Shading, images: _Images) -> JsonObject 
         return {"material": _colors(material, "diffuse", "specular", "f0") | {"slope": float(material.roughness)}}
     if not isinstance(material, TexturedMaterial) or shading.scale is None or part.color is not None:
         return None
-    if float(material.transmission) > 0:  # whose diffuse light is less
-        return None
     names = ("base_color", "metallic", "specular", "specular_color", "ior", "roughness", "emissive", "normal_scale")
+    names += ("transmission",)
     values: JsonObject = {name: np.asarray(getattr(material, name), float).tolist() for name in names}
     fields = {
         field.name.removesuffix("_texture"): getattr(material, field.name) for field in dataclasses.fields(material)

@@ -26,7 +26,7 @@ from tests.view.hand import CANVAS, TOLD, Hand
 SIZE = 8  # texels along a face's edge of lights
 WIDTH, HEIGHT = 96, 72
 SAME = 0.01  # of the mean of a picture, between the shader and Python
-SAVED = 0.03  # between pictures of nine samples and of one
+SAVED = 0.015  # between pictures of nine samples and of one
 
 LINE = "document.querySelector('#viewer').shadowRoot.querySelector('.line').textContent"
 UNSHADOWED = 0.05  # of the mean, for the horizon and the irradiance that are blurred
@@ -161,6 +161,12 @@ def clear(mode):
     return TexturedMaterial(base_color=(0.9, 0.4, 0.2), **options)
 
 
+def glass():
+    """Thin glass without a tint, whose roughness is an image."""
+    shares = Texture(np.random.default_rng(5).uniform(0.5, 1.0, (8, 16, 1)))
+    return TexturedMaterial(metallic=0.0, roughness=0.7, transmission=0.8, roughness_texture=shares)
+
+
 def mapped(**parameters):
     """A material with a normal map, whose image of emission no other texture shares."""
     glow = Texture(np.random.default_rng(4).uniform(0, 1, (8, 8, 3)))
@@ -180,7 +186,7 @@ CASES = {
     "harmonic": (GLOSSY, MATTE, prt.relit.Harmonics(2)),
     "holes": (clear("mask"), MATTE, prt.relit.Lobes(8, texels=2)),
     "translucent": (clear("blend"), MATTE, prt.relit.Lobes(8, texels=2)),
-    "glass": (TexturedMaterial(metallic=0.0, roughness=0.5, transmission=0.8), MATTE, prt.relit.Lobes(8, texels=2)),
+    "glass": (glass(), MATTE, prt.relit.Lobes(8, texels=2)),
 }
 
 
@@ -292,7 +298,7 @@ def test_the_sky_is_seen_through_translucent_surfaces(browser, lights):
     page = PageScene.for_gpu(relit).relit()
     true = page.picture(lights["lamp"], camera_of(hand), shadows="vertices")
     off = np.abs(hand.pixels() - np.asarray(image.display(image.expose(true, stops=stops)))).max(-1)
-    assert np.quantile(off, 0.98) < 4 / 255  # The ball fills a 25th of the picture.
+    assert np.quantile(off, 0.98) < 2 / 255  # half floats; the ball fills a 25th of the picture
     server.close()
     hand.page.close()
     assert not hand.errors

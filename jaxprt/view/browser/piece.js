@@ -332,7 +332,7 @@ export class Piece {
     gl.uniform1f(at("slope"), part.material.normal_scale);
     gl.uniform3fv(at("baseColor"), factors.base);
     gl.uniform3fv(at("f0"), factors.f0);
-    gl.uniform4f(at("factors"), factors.specular, factors.metallic, factors.roughness, 0);
+    gl.uniform4f(at("factors"), factors.specular, factors.metallic, factors.roughness, factors.passing);
     TEXTURES.forEach((name, i) => {
       if (!part.samplers[i]) return;
       const { transform, set } = part.textures[name];
@@ -390,14 +390,14 @@ export class Piece {
       tint = (change.specular ?? tint.map((x) => x / Math.max(most, 1e-6))).map((x) => x * strength);
     }
     const base = change?.diffuse ?? own.base_color, f0 = tint.map((x) => Math.min(white * x, 1)), dielectric = 1 - value.metallic, layer = dielectric * own.specular;
-    const under = 1 - Math.max(...f0), every = [
-      base.map((x) => layer * x * under),
+    const passing = 1 - own.transmission, under = 1 - Math.max(...f0), every = [
+      base.map((x) => passing * layer * x * under),
       f0.map((x, c) => layer * x + value.metallic * base[c]),
       f0.map((x, c) => layer * (1 - x) + value.metallic * (1 - base[c])),
-      base.map((x) => dielectric * (1 - own.specular) * x),
+      base.map((x) => passing * dielectric * (1 - own.specular) * x),
     ];
     this.write(part, every);
-    const factors = { base, f0, specular: own.specular, metallic: value.metallic, roughness: value.roughness };
+    const factors = { base, f0, specular: own.specular, metallic: value.metallic, roughness: value.roughness, passing };
     return { weightStep: 0, log: Math.log(Math.max(value.roughness, 1e-3 ** 0.5)), factors };
   }
   write(part, every) {

@@ -255,7 +255,7 @@ export class Pixels {
     return (this.images[name] = { handle, frame, width, height });
   }
   // Textures of triangles with depths of their own, of which one is drawn to while another one is read.
-  found(width, height, unit, depthUnits) {
+  targets(width, height, unit, depthUnits) {
     const { gl } = this, texture = (form, to) => {
       const handle = gl.createTexture();
       gl.activeTexture(gl.TEXTURE0 + to);
@@ -278,8 +278,8 @@ export class Pixels {
   find(matrix, columns, rows, width, height) {
     if (this.triangles?.width !== width || this.triangles.height !== height) {
       this.release();
-      const sets = [this.found(width, height, this.unit, [this.solidUnit])];
-      if (this.piece.blends) sets.push(this.found(width, height, this.layerUnit, [this.beforeUnit, this.beforeUnit]));
+      const sets = [this.targets(width, height, this.unit, [this.solidUnit])];
+      if (this.piece.blends) sets.push(this.targets(width, height, this.layerUnit, [this.beforeUnit, this.beforeUnit]));
       this.triangles = { sets, width, height };
     }
     const { gl } = this, [{ frames, depths }] = this.triangles.sets, bind = (texture) => {
@@ -287,11 +287,11 @@ export class Pixels {
       gl.bindTexture(gl.TEXTURE_2D, texture);
     };
     bind(null); // what is drawn to must not be read
-    this.trace(frames[0], matrix, columns, rows, false);
+    this.rasterize(frames[0], matrix, columns, rows, false);
     bind(depths[0]);
   }
   // Draws the triangles of solid parts, or those of translucent ones.
-  trace(frame, matrix, columns, rows, blending) {
+  rasterize(frame, matrix, columns, rows, blending) {
     const { gl, piece } = this, { raster } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
     gl.viewport(0, 0, columns, rows);
@@ -367,7 +367,7 @@ export class Pixels {
     gl.bindTexture(gl.TEXTURE_2D, depths[1 - now]);
     gl.useProgram(this.raster);
     gl.uniform1i(piece.at("peeled", this.raster), layer > 0 ? 1 : 0);
-    this.trace(frames[now], matrix, columns, rows, true);
+    this.rasterize(frames[now], matrix, columns, rows, true);
   }
   // Shades what `shown` has: backs and the sky first, then the solid parts or the translucent ones.
   surfaces({ width, height }, matrix, row, rows, shown, blending) {

@@ -36,7 +36,7 @@ uniform int edges[LEVELS], starts[LEVELS], lightEdges[WIDTHS], lightStarts[WIDTH
 uniform float spreads[LEVELS], lightSpreads[WIDTHS];
 uniform sampler2D coordinates, base_colorImage, roughnessImage, metallicImage, emissiveImage, normalImage;
 uniform int sampled, sets[5]; // which textures there are, and the coordinates and transform of each
-uniform vec3 across[5], upward[5], baseColor, f0, emissive; uniform vec4 factors; // specular, metallic, roughness
+uniform vec3 across[5], upward[5], baseColor, f0, emissive; uniform vec4 factors; // specular, metallic, roughness, and what is left of diffuse light where light passes
 uniform float slope; // of the normal map
 uniform bool glass; // which hides a share of what is behind it, and none of what it reflects itself
 ${AT} ${CUBE} ${BRIGHT}
@@ -301,7 +301,7 @@ vec3 shade() {
     rough = log(max((sampled & 2) > 0 ? factors.z * read(roughnessImage, 1).r : factors.z, .0316227766));
     if ((sampled & 8) > 0) color = emissive * read(emissiveImage, 3).rgb;
     if ((sampled & 16) > 0) tilt(rough);
-    for (int k = 0; k < 4; k++) if (k < channels) w[k] = (term[k] == 0 ? layer * base * (1. - max(f0.r, max(f0.g, f0.b))) : term[k] == 1 ? layer * f0 + metal * base : term[k] == 2 ? layer * (1. - f0) + metal * (1. - base) : dielectric * (1. - factors.x) * base) / scale[k];
+    for (int k = 0; k < 4; k++) if (k < channels) w[k] = (term[k] == 0 ? factors.w * layer * base * (1. - max(f0.r, max(f0.g, f0.b))) : term[k] == 1 ? layer * f0 + metal * base : term[k] == 2 ? layer * (1. - f0) + metal * (1. - base) : factors.w * dielectric * (1. - factors.x) * base) / scale[k];
   }
   if (lobes > 0 || bands > 0) {
     wo = normalize(eye - position);

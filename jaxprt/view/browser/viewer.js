@@ -308,6 +308,7 @@ export function mount(root, ask) {
     unfollow = follow(ask, () => ({ width: canvas.width, height: canvas.height }), heard);
   };
   const heard = (content) => {
+    if (closed) return;
     if (content.kind === "error") return tell(content.message);
     if (content.error) tell(content.error);
     waiting.set("progress", content.finished ? "" : content.stage, content.fraction);
@@ -327,7 +328,7 @@ export function mount(root, ask) {
     } catch { /* the next look tells */ }
   };
   // A light may have been dropped on another page of the same scene.
-  const returned = async () => { try { heard((await ask({ kind: "progress" })).content); } catch { /* the next look tells */ } };
+  const returned = async () => { if (!closed) try { heard((await ask({ kind: "progress" })).content); } catch { /* the next look tells */ } };
   frame.addEventListener("pointerenter", returned);
   const load = async () => {
     if (loading) return;
