@@ -215,8 +215,8 @@ def divisions(
             surface.divide(result[-1])
     if left > tolerated > 0:
         warnings.warn(
-            f"{count} vertices leave an error of {100 * left:.4g} % by interpolation, above the "
-            f"{100 * tolerated:.2g} % asked for; at most {vertices} were allowed",
+            f"{count} vertices leave an error of {100 * left:.4g} % by interpolation, above the limit of "
+            f"{100 * tolerated:.2g} %; at most {vertices} vertices were allowed",
             stacklevel=3,
         )
     return result, left
