@@ -121,7 +121,8 @@ def test_there_are_never_more_vertices_than_allowed_and_more_never_leave_a_large
         errors.append(true_error(mesh))
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < 0.1 * errors[0]
-    with pytest.warns(UserWarning, match=r"leave an error of .* above the limit of 1 %; at most 20 vertices were allowed"):
+    limit = r"leave an error of .* above the limit of 1 %; at most 20 vertices were allowed"
+    with pytest.warns(UserWarning, match=limit):
         refine(ground(), error=0.01, vertices=20, **options)
 
 
