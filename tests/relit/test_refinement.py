@@ -91,7 +91,7 @@ def test_meshes_stay_as_they_are_on_demand_and_where_nothing_is_gained(scene):
 
 
 def test_a_limit_of_vertices_is_told(scene):
-    with pytest.warns(UserWarning, match="at most 40 were allowed"):
+    with pytest.warns(UserWarning, match="at most 40 vertices were allowed"):
         relit = prt.precompute(
             scene, refine=0.001, vertices=40, system=prt.relit.Harmonics(degree=1), size=8, progress=False
         )

@@ -46,6 +46,11 @@ class Hand:
         before = self.stats()["stills"]
         self.settle()
         self.wait(f"stills > {before}")
+        self.finish()
+
+    def finish(self):
+        """Until the newest state is shown, and nothing more is drawn."""
+        self.settle()
         drawn = -1
         while drawn != (now := self.stats()["draws"]):
             drawn = now
