@@ -26,6 +26,7 @@ from tests.view.hand import CANVAS, TOLD, Hand
 SIZE = 8  # texels along a face's edge of lights
 WIDTH, HEIGHT = 96, 72
 SAME = 0.01  # of the mean of a picture, between the shader and Python
+COARSE = 0.25  # between a first frame of 12 x 9 colors and the picture at rest
 SAVED = 0.015  # between pictures of nine samples and of one
 
 LINE = "document.querySelector('#viewer').shadowRoot.querySelector('.line').textContent"
@@ -41,8 +42,14 @@ SHADES = """async ({ module, data, message, angle, radius, backs, size }) => {
   const pixels = new Pixels(gl, piece, backs);
   const camera = new Camera({ eye: message.eye, target: message.target, radius, field_of_view: angle });
   const matrix = camera.matrix(size.width / size.height, [0, 0, 0]);
-  pixels.change(message);
-  for (let now = 0; ; now += 1000) {
+  pixels.change({ ...message, field_of_view: angle });
+  pixels.work(0, matrix, size.width, size.height, false);
+  const first = new Float32Array(4 * size.width * size.height), edge = pixels.stats.level;
+  if (pixels.sharpens) {
+    gl.bindFramebuffer(gl.FRAMEBUFFER, pixels.shown.frame);
+    gl.readPixels(0, 0, size.width, size.height, gl.RGBA, gl.FLOAT, first);
+  }
+  for (let now = 1000; ; now += 1000) {
     if (pixels.busy) { await new Promise((resolve) => setTimeout(resolve, 5)); continue; }
     if (!pixels.work(now, matrix, size.width, size.height, false) || pixels.stats.samples > 0) break;
   }
@@ -55,7 +62,8 @@ SHADES = """async ({ module, data, message, angle, radius, backs, size }) => {
   for (let frame = 0; frame < 8; frame++) pixels.learn(3000, true);
   const error = gl.getError(), slow = pixels.slow;
   pixels.close();
-  return { error, slow, data: Array.from(read.data), saved: piece.blends ? Array.from(saved) : null };
+  const listed = (data, there) => (there ? Array.from(data) : null), { blends } = piece;
+  return { error, slow, edge, first: listed(first, !blends), data: Array.from(read.data), saved: listed(saved, blends) };
 }"""
 
 
@@ -98,7 +106,12 @@ def shaded(browser):
         assert result["error"] == 0
         assert result["slow"]  # frames of three seconds are left to Python
         shape = camera.height, camera.width, 4
-        image, saved = (result[name] and np.reshape(result[name], shape)[::-1] for name in ("data", "saved"))
+        names = "data", "saved", "first"
+        image, saved, first = (result[name] and np.reshape(result[name], shape)[::-1] for name in names)
+        if first is not None:  # pixels of 8 x 8, with edges of surfaces as fine as at rest
+            assert result["edge"] == 8
+            assert np.abs(first[..., 3] - image[..., 3]).mean() < 0.01
+            assert np.abs(first - image)[..., :3].mean() < COARSE * image[..., :3].mean()
         if saved is not None:  # a picture of nine samples, with layers at each
             assert np.abs(saved - image).mean() < SAVED * np.abs(image).mean()
         return image

@@ -1,10 +1,11 @@
 // Draws the sky, the mesh with colors at its vertices, and pictures at rest.
 
-import { clamp, toLinear } from "./common.js";
+import { clamp } from "./common.js";
 import { toHalf } from "./lights.js";
 import { WIDTH } from "./shading.js";
 import { drawSides } from "./pixels.js";
 
+const MOST_STOPS = 20; // luminances are measured from its negative on
 const VERTEX = `#version 300 es
 layout(location=0) in vec3 position; layout(location=1) in vec3 color; uniform mat4 matrix; out vec3 c;
 void main(){ c = color; gl_Position = matrix * vec4(position, 1); }`;
@@ -25,8 +26,11 @@ vec3 agx(vec3 x){
   x = (((((15.5 * x - 40.14) * x + 31.96) * x - 6.868) * x + .4298) * x + .1191) * x - .00232;
   x = x * inverse(mat3(.899796956, .0871996192, .0130034249, .111420989, .875575586, .0130034249, .111420989, .0871996192, .801379392));
   return pow(max(x, 1e-6), vec3(2.2)) * back; }
+vec3 measured(vec3 x){ // the logarithm of luminance, in two bytes
+  float code = clamp(log2(max(dot(x, vec3(.2126, .7152, .0722)), 1e-20)) * 255. / ${2 * MOST_STOPS}. + 127.5, 0., 255.);
+  return vec3(floor(code) / 255., fract(code), 0.); }
 // The curves of jaxprt/image/tonemap.py. Matrices stand in rows, to the right of vectors.
-vec3 display(vec3 x){ if (encoded) return x; x = clamp(x * gain, 0., 1e6);
+vec3 display(vec3 x){ if (encoded) return x; x = clamp(x * gain, 0., 1e6); if (tone < 0) return measured(x);
   x = clamp(tone == 1 ? hable(2. * x) / hable(vec3(11.2)) : tone == 2 ? agx(x) : tone == 3 ? aces(x) : x, 0., 1.);
   return mix(12.92 * x, 1.055 * pow(max(x, vec3(1e-6)), vec3(1. / 2.4)) - .055, step(.0031308, x)); }`;
 const MESH = `#version 300 es
@@ -60,12 +64,14 @@ export class Drawing {
   constructor(canvas) {
     this.canvas = canvas;
     this.gpu = null; // shades pixels; null where colors come from Python
+    [this.unexposed, this.exposed] = [false, null]; // whether the next picture is measured, and what is called with its exposure
     const gl = (this.gl = canvas.getContext("webgl2", { alpha: false, antialias: true, preserveDrawingBuffer: true }));
     if (!gl) throw new Error("this browser has no WebGL2, which the viewer needs");
     this.build();
   }
   build() {
     const gl = this.gl;
+    gl.programs = new Map(); // those of a context that was lost are gone
     const program = (vertex, fragment) => {
       const handle = gl.createProgram();
       for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
@@ -208,7 +214,7 @@ export class Drawing {
   // Draws a frame: true if another one is to follow. `python` says whether pictures at rest come from there, and `fresh`
   // whether more has changed than what pixels show.
   draw(camera, state, center, now, python, fresh) {
-    const { gl, gpu } = this, { width, height } = this.canvas, gain = 2 ** state.stops, tone = TONES.indexOf(state.tone);
+    const { gl, gpu } = this, { width, height } = this.canvas;
     if (gpu?.busy) {
       this.late ||= fresh;
       return true;
@@ -216,6 +222,11 @@ export class Drawing {
     const more = gpu?.work(now, camera.matrix(width / height, center), width, height, python) ?? false;
     if (more && !fresh && !this.late && !gpu.fresh && !this.stills.length) return true;
     this.late = false;
+    if (this.unexposed && (gpu ? gpu.message : this.drawn)) {
+      this.unexposed = false;
+      this.exposed(this.exposure(camera, state, center));
+    }
+    const gain = 2 ** state.stops, tone = TONES.indexOf(state.tone);
     this.paint(camera, state, center, this.canvas, [0.1, 0.1, 0.1, 1], gpu?.shown);
     let alpha = 1;
     gl.enable(gl.BLEND);
@@ -241,8 +252,8 @@ export class Drawing {
   }
   // Bytes, RGBA from the lower left, of what is painted at a size of its own: an image of shaded pixels, or colors at
   // vertices without one. Alpha is 0 where there is only the ground.
-  pixels(camera, state, center, { width, height }, image = null) {
-    const gl = this.gl, most = gl.getParameter(gl.MAX_RENDERBUFFER_SIZE), samples = Math.min(4, gl.getParameter(gl.MAX_SAMPLES));
+  pixels(camera, state, center, { width, height }, image = null, mostSamples = 4) {
+    const gl = this.gl, most = gl.getParameter(gl.MAX_RENDERBUFFER_SIZE), samples = Math.min(mostSamples, gl.getParameter(gl.MAX_SAMPLES));
     if (Math.max(width, height) > most) throw new Error(`a picture must have at most ${most} pixels along an edge in this browser, got ${width} x ${height}`);
     const buffer = (count, kind, place) => {
       const handle = gl.createRenderbuffer();
@@ -268,25 +279,13 @@ export class Drawing {
     return result;
   }
   // Stops at which the brightest surfaces that are seen come near white, as `jaxprt.image.automatic_exposure` has them:
-  // the 99th percentile of luminance over pixels that surfaces fill is 0.9. Bytes hold it once it is neither white nor
-  // black. Null where no surface is seen, or all is black.
+  // the 99th percentile of luminance over pixels that surfaces fill is 0.9. Null where no surface is seen, or all is black.
   exposure(camera, state, center) {
-    const { gpu } = this, height = 96, width = Math.max(1, Math.round((height * this.canvas.width) / this.canvas.height));
-    // Vertices show no holes, and nothing behind what is translucent.
-    const image = gpu?.piece.opacities.length ? gpu.glance(camera.matrix(width / height, center), width, height) : null;
-    for (let stops = 0, tries = 0; tries < 12; tries++) {
-      const pixel = this.pixels(camera, { ...state, stops, tone: TONES[0], background: false }, center, { width, height }, image), lit = [];
-      for (let i = 0; i < pixel.length; i += 4) {
-        if (pixel[i + 3] < 255) continue;
-        const [r, g, b] = [0, 1, 2].map((c) => toLinear(pixel[i + c] / 255)), luminance = 0.2126 * r + 0.7152 * g + 0.0722 * b;
-        if (luminance > 0) lit.push(luminance);
-      }
-      const bright = lit.sort((x, y) => x - y)[Math.round(0.99 * (lit.length - 1))];
-      if (bright > 0.1 && bright < 0.6) return stops + Math.log2(0.9 / bright);
-      if (bright === undefined && tries > 5) return null; // black, at 2^18 times the light, too
-      stops += bright === undefined ? 3 : bright < 0.6 ? Math.log2(0.3 / bright) : -3;
-    }
-    return null;
+    const height = 96, width = Math.max(1, Math.round((height * this.canvas.width) / this.canvas.height));
+    const pixel = this.pixels(camera, { ...state, stops: 0, tone: "", background: false }, center, { width, height }, this.gpu?.shown, 0), lit = [];
+    for (let i = 0; i < pixel.length; i += 4) if (pixel[i + 3] === 255 && pixel[i] + pixel[i + 1]) lit.push(pixel[i] + pixel[i + 1] / 255);
+    const bright = lit.sort((x, y) => x - y)[Math.round(0.99 * (lit.length - 1))];
+    return bright === undefined ? null : Math.log2(0.9) - ((bright - 127.5) * 2 * MOST_STOPS) / 255;
   }
   close() { this.gl.getExtension("WEBGL_lose_context")?.loseContext(); }
 }

@@ -56,22 +56,35 @@ export function rimmed(light, edge, index, result, start) {
 }
 
 // Blurs a light to all widths, as `jaxprt.lobe.prefilter` does; which texels each takes, and how much, is made once.
+const blurs = new Map();
 export class Blur {
+  static of(scale, index) {
+    const key = JSON.stringify(scale);
+    if (!blurs.has(key)) blurs.set(key, new Blur(scale, index));
+    return blurs.get(key);
+  }
   constructor(scale, index) {
     Object.assign(this, { scale, index });
     this.levels = scale.edges.map((edge, i) => (i ? this.taps(edge, scale.sources[i], scale.concentrations[i], scale.reaches[i]) : null));
   }
   taps(edge, source, concentration, reach) {
     const to = grid(edge).way, { way, area } = grid(source), least = Math.cos(reach), from = [0], index = [], weight = [];
+    // Blocks of texels out of reach are left out: of the directions of blocks, none is further from their texels than `wide`.
+    const parts = Math.min(4, source), blocks = grid(source / parts).way, wide = reach + (1.5 * parts) / source, nearest = wide < Math.PI ? Math.cos(wide) : -1;
+    const members = Array.from({ length: blocks.length / 3 }, () => []), dot = (a, i, b, j) => a[3 * i] * b[3 * j] + a[3 * i + 1] * b[3 * j + 1] + a[3 * i + 2] * b[3 * j + 2];
+    area.forEach((_, j) => members[whole(j, source / parts, parts)].push(j));
     for (let i = 0; i < 6 * edge * edge; i++) {
       let total = 0;
-      for (let j = 0; j < 6 * source * source; j++) {
-        const cosine = to[3 * i] * way[3 * j] + to[3 * i + 1] * way[3 * j + 1] + to[3 * i + 2] * way[3 * j + 2];
-        if (cosine < least) continue;
-        const each = area[j] * Math.exp(concentration * (cosine - 1));
-        index.push(j);
-        weight.push(each);
-        total += each;
+      for (let block = 0; block < members.length; block++) {
+        if (dot(to, i, blocks, block) < nearest) continue;
+        for (const j of members[block]) {
+          const cosine = dot(to, i, way, j);
+          if (cosine < least) continue;
+          const each = area[j] * Math.exp(concentration * (cosine - 1));
+          index.push(j);
+          weight.push(each);
+          total += each;
+        }
       }
       for (let k = from[i]; k < index.length; k++) weight[k] /= total;
       from.push(index.length);

@@ -125,10 +125,18 @@ export class Piece {
     const { gl } = this;
     for (const part of this.content.parts) for (const handle of [...part.samplers, part.stencil]) if (handle) gl.deleteTexture(handle);
     for (const { handle, frame } of Object.values(this.textures)) { gl.deleteTexture(handle); if (frame) gl.deleteFramebuffer(frame); }
-    for (const program of Object.values(this.programs)) gl.deleteProgram(program);
     gl.deleteVertexArray(this.empty);
   }
+  // A program, which later scenes of the context use again.
   link(vertex, fragment) {
+    const gl = this.gl, kept = (gl.programs ??= new Map()), key = vertex + fragment;
+    if (!kept.has(key)) kept.set(key, this.compile(vertex, fragment));
+    const program = kept.get(key);
+    gl.useProgram(program);
+    for (const [name, { unit }] of Object.entries(this.textures)) gl.uniform1i(this.at(name, program), unit);
+    return program;
+  }
+  compile(vertex, fragment) {
     const gl = this.gl, program = gl.createProgram();
     for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
       const shader = gl.createShader(kind);
@@ -138,8 +146,6 @@ export class Piece {
       gl.attachShader(program, shader);
     }
     gl.linkProgram(program);
-    gl.useProgram(program);
-    for (const [name, { unit }] of Object.entries(this.textures)) gl.uniform1i(this.at(name, program), unit);
     return program;
   }
   allocate(name, internal, entries) {
@@ -223,7 +229,7 @@ export class Piece {
         if (edge > content.mips.at(-1)) light = halved(light, edge);
       }
       if (content.glossy) {
-        this.blur ??= new Blur(content.light, this.index);
+        this.blur ??= Blur.of(content.light, this.index);
         this.texture("light", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.blur.apply(this.mips), 4);
       }
       [this.lit, this.turned] = [key, ""];

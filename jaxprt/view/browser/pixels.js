@@ -2,26 +2,32 @@
 // Translucent surfaces are shaded before it, layer by layer from the eye on, and each hides its share of what follows.
 
 import { clamp, floats } from "./common.js";
-import { WHOLE, WIDTH } from "./shading.js";
+import { AT, WHOLE, WIDTH } from "./shading.js";
 
 const RASTER = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
-uniform usampler2D faces; uniform sampler2D place, opacities; uniform mat4 matrix; flat out uvec3 triangle; out vec2 part; out vec3 clear;
-ivec2 at(int i) { return ivec2(i & ${WIDTH - 1}, i >> 12); }
+uniform usampler2D faces; uniform sampler2D place, opacities; uniform mat4 matrix; flat out uvec3 triangle; out vec2 part; out vec3 clear, spot, upright;
+${AT}
 void main() {
   int corner = gl_VertexID % 3;
   triangle = texelFetch(faces, at(gl_VertexID / 3), 0).rgb;
   part = vec2(corner == 0, corner == 1);
   clear = texelFetch(opacities, at(int(triangle[corner])), 0).xyz;
-  gl_Position = matrix * vec4(texelFetch(place, at(2 * int(triangle[corner])), 0).xyz, 1);
+  spot = texelFetch(place, at(2 * int(triangle[corner])), 0).xyz;
+  upright = texelFetch(place, at(2 * int(triangle[corner]) + 1), 0).xyz;
+  gl_Position = matrix * vec4(spot, 1);
 }`;
+const STENCIL = `
+uniform sampler2D stencil; uniform bool holes, imaged; uniform float cutoff;
+float opacityOf(vec3 clear) { return clear.z * (imaged ? textureLod(stencil, vec2(clear.x, 1. - clear.y), 0.).r : 1.); }`;
 const TRIANGLE = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; flat in uvec3 triangle; in vec2 part; in vec3 clear; out uvec4 o;
-uniform sampler2D stencil, solid, before; uniform bool holes, imaged, peeled; uniform float cutoff;
+uniform sampler2D solid, before; uniform bool peeled;
+${STENCIL}
 void main() {
   float opacity = 1.;
   if (holes) {
-    opacity = clear.z * (imaged ? textureLod(stencil, vec2(clear.x, 1. - clear.y), 0.).r : 1.);
+    opacity = opacityOf(clear);
     ivec2 here = ivec2(gl_FragCoord.xy);
     if (cutoff >= 0.) {
       if (opacity < cutoff) discard;
@@ -30,6 +36,33 @@ void main() {
   }
   uint hides = uint(255. * opacity + .5) << 24;
   o = gl_FrontFacing ? uvec4(triangle.x | hides, triangle.yz, packUnorm2x16(part)) : uvec4(0xfffffeu | hides, 0u, 0u, 0u);
+}`;
+// Coarse colors on the surfaces of each pixel: from the pixels about it that show the same surface.
+const SHARP = `#version 300 es
+precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D; in vec3 clear, spot, upright; out vec4 o;
+uniform sampler2D image, place; uniform usampler2D shown; uniform ivec2 size; uniform float step, width; uniform vec3 eye; // width: of a coarse pixel at a distance of one
+${AT} ${STENCIL}
+void main() {
+  if (holes && opacityOf(clear) < cutoff) discard;
+  o = vec4(0, 0, 0, 1);
+  if (!gl_FrontFacing) return;
+  vec2 middle = gl_FragCoord.xy / step - .5, low = floor(middle), part = middle - low;
+  vec4 sum = vec4(0);
+  float total = 0., reach = width * distance(spot, eye);
+  vec3 normal = normalize(upright);
+  for (int ring = 0; ring < 2 && total == 0.; ring++) for (int j = -ring; j < 2 + ring; j++) for (int i = -ring; i < 2 + ring; i++) {
+    ivec2 pixel = clamp(ivec2(low) + ivec2(i, j), ivec2(0), size - 1);
+    int vertex = int(texelFetch(shown, pixel, 0).r & 0xffffffu);
+    if (vertex >= 0xfffffe) continue;
+    vec3 facing = texelFetch(place, at(2 * vertex + 1), 0).xyz;
+    vec2 near = max(1. - abs(vec2(i, j) - part), 0.);
+    float off = dot(facing, spot - texelFetch(place, at(2 * vertex), 0).xyz) / reach, like = max(dot(facing, normal), 0.);
+    float weight = (near.x * near.y + 1e-3) * (pow(like, 8.) + 1e-3) / (1. + off * off);
+    sum += weight * texelFetch(image, pixel, 0);
+    total += weight;
+  }
+  if (total == 0.) discard;
+  o = sum / total;
 }`;
 const BARE = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D; uniform usampler2D shown; out vec4 o;
@@ -45,7 +78,7 @@ const EMPTY = Uint32Array.of(0xffffffff, 0, 0, 0);
 const LAYERS = 4; // translucent surfaces that a pixel shows
 const STRIPS = 8; // of a picture with layers, at most
 
-const PIXEL_EDGES = [0, 4, 2, 1]; // while something moves: colors at vertices, or edges of pixels
+const PIXEL_EDGES = [0, 8, 4, 2, 1]; // while something moves: colors at vertices, or edges of pixels
 const SLUGGISH = 45, BRISK = 22; // milliseconds of a frame from which on there are fewer pixels, and up to which more are tried
 const PAUSE = 150; // milliseconds without a change until a picture at rest begins
 const PATIENCE = 3000; // milliseconds of a first picture at rest after which it is left to Python, where there is one
@@ -68,12 +101,14 @@ export class Pixels {
     this.raster = piece.link(RASTER, TRIANGLE);
     this.rest = piece.link(WHOLE, BARE);
     this.copy = piece.link(WHOLE, COPY);
+    this.sharp = piece.link(RASTER, SHARP);
     [this.unit, this.layerUnit, this.solidUnit, this.beforeUnit, this.stencilUnit] = [0, 0, 0, 0, 0].map(() => piece.unit++);
+    piece.ints(this.sharp, { image: 0, shown: this.unit, stencil: this.stencilUnit });
     gl.useProgram(this.raster);
     piece.ints(this.raster, { solid: this.solidUnit, before: this.beforeUnit, stencil: this.stencilUnit });
     this.floats = floats(gl);
     this.images = {};
-    this.triangles = null;
+    this.triangles = this.many = null;
     this.fence = null;
     this.used = new Set(); // levels that have been seen once
     this.shown = null; // the image that is seen; none while colors at vertices are
@@ -91,9 +126,7 @@ export class Pixels {
     const { gl, piece } = this;
     for (const { handle, frame } of Object.values(this.images)) { gl.deleteTexture(handle); gl.deleteFramebuffer(frame); }
     this.release();
-    gl.deleteProgram(this.raster);
-    gl.deleteProgram(this.rest);
-    gl.deleteProgram(this.copy);
+    this.forget();
     if (this.fence) gl.deleteSync(this.fence.sync);
     piece.close();
   }
@@ -148,18 +181,20 @@ export class Pixels {
   // Gives the GPU the work of a frame. True if there is more to do.
   work(now, matrix, width, height, python) {
     this.fresh = false; // whether more is seen after it
-    this.least = this.floats && (this.piece.opacities.length || this.piece.count > (width * height) / 4) ? 1 : 0; // vertices show no holes, and may be more than pixels
+    this.least = this.floats && (this.piece.opacities.length || this.piece.count > (width * height) / PIXEL_EDGES[1] ** 2) ? 1 : 0; // vertices show no holes, and may be more than pixels
     this.level = this.floats ? Math.max(this.level, this.least) : 0;
     if (this.stale) {
       this.stale = false;
       this.since = now + PAUSE;
       [this.sample, this.row] = [0, 0];
+      // At rest pixels become finer step by step.
+      this.steps = this.sharpens ? PIXEL_EDGES.filter((each, level) => each > 1 && level > this.level) : [];
       this.move(matrix, width, height);
       return true;
     }
     if (!this.message || !this.floats || this.sample >= JITTER.length) return false;
     if (now < this.since) return true;
-    if (python && !this.sample && now - this.since > PATIENCE) return false;
+    if (python && !this.steps.length && !this.sample && now - this.since > PATIENCE) return false;
     this.refine(matrix, width, height);
     return this.sample < JITTER.length;
   }
@@ -171,43 +206,77 @@ export class Pixels {
       const size = [width, height].map((x) => Math.ceil(x / step));
       this.piece.shine(this.message);
       this.find(matrix, ...size, width, height);
-      this.shown = this.image(`step ${step}`, ...size);
-      this.shade(this.shown, matrix, 0, size[1], 1);
+      const image = this.image(`step ${step}`, ...size);
+      this.shade(image, matrix, 0, size[1], 1);
+      this.shown = step > 1 && this.sharpens ? this.sharpened(image, matrix, step, width, height) : image;
     } else {
       this.piece.vertices(this.message);
       this.shown = null;
     }
     this.sent(true);
   }
-  // One strip of the picture at rest; each sample counts as much as those before.
+  // One strip of the picture at rest: of finer pixels, or of a sample, which counts as much as those before.
   refine(matrix, width, height) {
     this.piece.shine(this.message);
-    const moved = jittered(matrix, JITTER[this.sample], width, height);
-    if (!this.row) this.find(moved, width, height, width, height);
-    const image = this.image("rest", width, height), rows = this.rows(this.row, width, height);
-    this.shade(image, moved, this.row, rows, 1 / (this.sample + 1));
+    const step = this.steps[0] ?? 1, size = [width, height].map((x) => Math.ceil(x / step));
+    const moved = step > 1 ? matrix : jittered(matrix, JITTER[this.sample], width, height);
+    if (!this.row) this.find(moved, ...size, width, height);
+    const image = this.image(step > 1 ? `step ${step}` : "rest", ...size), rows = this.rows(this.row, ...size);
+    this.shade(image, moved, this.row, rows, step > 1 ? 1 : 1 / (this.sample + 1));
     this.row += rows;
-    this.fresh = this.row >= height;
-    if (this.row >= height) {
+    this.fresh = this.row >= size[1];
+    if (this.fresh) {
       this.row = 0;
-      this.stats.samples = ++this.sample;
-      this.shown = image;
+      this.shown = step > 1 ? this.sharpened(image, matrix, step, width, height) : image;
+      if (step > 1) this.stats.level = this.steps.shift();
+      else this.stats.samples = ++this.sample;
     }
     this.sent(false);
+  }
+  // A framebuffer of several samples a pixel, which are drawn together.
+  multisampled(width, height) {
+    const { gl, many } = this;
+    if (many?.width === width && many.height === height) return many.frame;
+    this.forget();
+    const frame = gl.createFramebuffer(), buffers = [[gl.RGBA16F, gl.COLOR_ATTACHMENT0], [gl.DEPTH_COMPONENT24, gl.DEPTH_ATTACHMENT]].map(([form, place]) => {
+      const handle = gl.createRenderbuffer();
+      gl.bindRenderbuffer(gl.RENDERBUFFER, handle);
+      gl.renderbufferStorageMultisample(gl.RENDERBUFFER, Math.min(4, gl.getInternalformatParameter(gl.RENDERBUFFER, gl.RGBA16F, gl.SAMPLES)[0] ?? 0), form, width, height);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+      gl.framebufferRenderbuffer(gl.FRAMEBUFFER, place, gl.RENDERBUFFER, handle);
+      return handle;
+    });
+    this.many = { frame, buffers, width, height };
+    return frame;
+  }
+  forget() {
+    const { gl, many } = this;
+    if (many) gl.deleteFramebuffer(many.frame);
+    for (const each of many?.buffers ?? []) gl.deleteRenderbuffer(each);
+    this.many = null;
+  }
+  // Whether coarse pixels can be made fine along the edges of surfaces.
+  get sharpens() { return this.floats && !this.piece.blends; }
+  // A picture of fine edges with the colors of coarse pixels, whose triangles have just been found.
+  sharpened(coarse, matrix, step, width, height) {
+    const { gl, piece, sharp } = this, image = this.image("sharp", width, height), frame = this.multisampled(width, height);
+    gl.useProgram(sharp);
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, coarse.handle);
+    gl.uniform2i(piece.at("size", sharp), coarse.width, coarse.height);
+    gl.uniform1f(piece.at("step", sharp), step);
+    gl.uniform1f(piece.at("width", sharp), (2 * step * Math.tan(this.message.field_of_view / 2)) / height);
+    gl.uniform3fv(piece.at("eye", sharp), this.message.eye);
+    this.rasterize(frame, matrix, width, height, false, sharp);
+    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, frame);
+    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, image.frame);
+    gl.blitFramebuffer(0, 0, width, height, 0, 0, width, height, gl.COLOR_BUFFER_BIT, gl.NEAREST);
+    piece.finish();
+    return image;
   }
   // Rows of the next strip. Each has layers of its own, whatever its height, so that with layers there are few.
   rows(row, width, height) {
     return clamp(Math.floor(this.strip / width), this.piece.blends ? Math.min(Math.ceil(height / STRIPS), height - row) : 1, height - row);
-  }
-  // A small picture with one sample, at once; null while another one of its own size is made.
-  glance(matrix, width, height) {
-    if (!this.floats || this.held) return null;
-    this.piece.shine(this.message);
-    this.find(matrix, width, height, width, height);
-    const image = this.image("glance", width, height);
-    this.shade(image, matrix, 0, height, 1);
-    this.stale = true; // the triangles of frames are lost
-    return image;
   }
   // A picture of a size of its own, as at rest. Frames wait for it. `dispose` is to be called once it has been read.
   async whole(matrix, width, height) {
@@ -291,11 +360,12 @@ export class Pixels {
     bind(depths[0]);
   }
   // Draws the triangles of solid parts, or those of translucent ones.
-  rasterize(frame, matrix, columns, rows, blending) {
-    const { gl, piece } = this, { raster } = this;
+  rasterize(frame, matrix, columns, rows, blending, raster = this.raster) {
+    const { gl, piece } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
     gl.viewport(0, 0, columns, rows);
-    gl.clearBufferuiv(gl.COLOR, 0, EMPTY);
+    if (raster === this.raster) gl.clearBufferuiv(gl.COLOR, 0, EMPTY);
+    else gl.clearBufferfv(gl.COLOR, 0, new Float32Array(4));
     gl.clear(gl.DEPTH_BUFFER_BIT);
     gl.useProgram(raster);
     gl.bindVertexArray(piece.empty);

@@ -3,7 +3,7 @@
 
 export const WIDTH = 4096; // columns of all textures that hold arrays
 
-const AT = `ivec2 at(int i) { return ivec2(i & ${WIDTH - 1}, i >> 12); }`;
+export const AT = `ivec2 at(int i) { return ivec2(i & ${WIDTH - 1}, i >> 12); }`;
 const CUBE = `
 void project(vec3 d, out int face, out float s, out float t) {
   vec3 a = abs(d);

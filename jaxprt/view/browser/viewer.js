@@ -106,7 +106,7 @@ export function mount(root, ask) {
     gpu.change(message("look"));
     if (state.auto && exposed !== state.light) {
       exposed = state.light;
-      find();
+      drawing.unexposed = true;
     }
     Object.assign(stats, { got: stats.got + 1, shown: seq });
     tell("");
@@ -139,7 +139,7 @@ export function mount(root, ask) {
         drawing.setColor(data, compressed, content.scale);
         if (unexposed && state.light === own.light) {
           exposed = own.light;
-          find();
+          drawing.unexposed = true;
         }
         stats.trip = performance.now() - began;
         looked++;
@@ -229,11 +229,10 @@ export function mount(root, ask) {
 
   const set = (fields) => { Object.assign(state, fields); controls?.show(); moved(); };
   // The exposure for what is seen: at the start, when the light is another one, or when it is asked for.
-  const find = () => {
-    const stops = drawing.exposure(camera, state, scene.center);
+  const found = (stops) => {
     if (stops !== null) state.stops = Math.round(10 * stops) / 10;
     controls?.show();
-    if (long) moved(); else redraw();
+    if (long) moved();
   };
   const automatic = (auto) => {
     [state.auto, exposed] = [auto, null];
@@ -369,6 +368,7 @@ export function mount(root, ask) {
     }
   };
   try { drawing = new Drawing(canvas); } catch (error) { tell(error.message); return () => {}; }
+  drawing.exposed = found;
   const hands = gestures(canvas, frame, { get camera() { return camera; }, state, scene: () => scene, set, expose, automatic, moved, drop, reset, lookAt, pick, help, toggleHelp: view.toggleHelp });
   frame.addEventListener("theme", () => controls?.show());
   canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); if (!closed) tell("the graphics context was lost; it comes back by itself"); });
