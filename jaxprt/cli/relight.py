@@ -79,7 +79,7 @@ def command(chosen: SimpleNamespace) -> options.Result:
         plan: Use the plan in this folder, written by `jaxprt plan`.
         animate: Write N pictures by each system with changing light, view and materials.
         table: Report errors of each system at several sizes, on N vertices of the first part.
-        tone: Tone curve of the PNG files: clamped radiance, or Hable's, AgX or ACES.
+        tone: Tone curve of the PNG files: clamped radiance, or Hable's, AgX, ACES or Khronos Neutral.
         part: Only precompute the K-th of N parts into a shared --output.
     """  # noqa: D301
     systems = _systems(chosen)

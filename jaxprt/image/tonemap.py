@@ -18,7 +18,8 @@ from jaxprt.image.arguments import STOPS, numbers
 
 Pixels = Float[Array | np.ndarray, "..."]
 
-TONES = ("srgb", "filmic", "agx", "aces")
+TONES = ("srgb", "filmic", "agx", "aces", "neutral")
+_OF_COLORS = ("agx", "aces", "neutral")  # curves of three colors at once
 _WHITE = 11.2  # linear value that the filmic curve maps to 1, after the doubling
 # Rows of matrices. Hill 2016: sRGB to the AP1 primaries of the RRT, and back.
 _ACES_IN = ((0.59719, 0.35458, 0.04823), (0.07600, 0.90834, 0.01566), (0.02840, 0.13383, 0.83777))
@@ -41,6 +42,7 @@ _OUTSET = np.linalg.inv(
     )
 )
 _LEAST, _MOST = -12.47393, 4.026069  # binary logarithms that the curve of AgX begins and ends at
+_KNEE, _PALE = 0.76, 0.15  # of the neutral curve: the value that it compresses from on, and how fast colors become pale
 _SIGMOID = (15.5, -40.14, 31.96, -6.868, 0.4298, 0.1191, -0.00232)  # its coefficients, from the highest power
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # weights of linear Rec. 709 RGB
 
@@ -49,7 +51,7 @@ def apply_curve(linear: Pixels, tone: str, xp: ModuleType) -> Pixels:
     """Applies a tone curve.
 
     Args:
-        linear: Exposed radiance in linear Rec. 709; the last axis is of three colors for "agx" and "aces".
+        linear: Exposed radiance in linear Rec. 709; the last axis is of three colors for "agx", "aces" and "neutral".
         tone: One of `TONES`.
         xp: NumPy, or `jax.numpy` for JAX arrays.
 
@@ -57,7 +59,7 @@ def apply_curve(linear: Pixels, tone: str, xp: ModuleType) -> Pixels:
         Linear values from 0 to 1 in Rec. 709, to be encoded as sRGB.
     """
     # Infinite values are displayed as white, and the curves are constant long before these bounds.
-    curve = {"srgb": _same, "filmic": _filmic, "agx": _agx, "aces": _aces}[tone]
+    curve = {"srgb": _same, "filmic": _filmic, "agx": _agx, "aces": _aces, "neutral": _neutral}[tone]
     return xp.clip(curve(xp.clip(linear, 0, 1e6), xp), 0, 1)
 
 
@@ -89,6 +91,16 @@ def _agx(x: Pixels, xp: ModuleType) -> Pixels:
         y = y * x + coefficient
     y = xp.maximum(_by(_OUTSET, y, xp), 1e-6)  # as black as 0, with a finite slope
     return _by(_TO_REC709, y**2.2, xp)
+
+
+def _neutral(x: Pixels, xp: ModuleType) -> Pixels:
+    """Khronos PBR Neutral 2024: base colors under white light as they are, and highlights compressed."""
+    least = xp.min(x, axis=-1, keepdims=True)
+    x = x - xp.where(least < 0.08, least - 6.25 * least**2, 0.04)
+    peak = xp.maximum(xp.max(x, axis=-1, keepdims=True), _KNEE)
+    new = 1 - (1 - _KNEE) ** 2 / (peak + 1 - 2 * _KNEE)
+    share = 1 / (_PALE * (peak - new) + 1)
+    return x * (new / peak) * share + new * (1 - share)
 
 
 def _by(matrix: np.ndarray | tuple, x: Pixels, xp: ModuleType) -> Pixels:
@@ -205,18 +217,19 @@ def display(
     * "filmic": Hable 2010, the curve of Uncharted 2, with its exposure bias of 2 and its white of 11.2. For each color.
     * "agx": Sobotka's AgX of Blender 4, base look, in the form of Filament and three.js. Bright colors become pale.
     * "aces": Hill's fit of the ACES reference rendering transform, scaled by 1 / 0.6 as in three.js. Contrasty.
+    * "neutral": Khronos PBR Neutral. Base colors keep their hue and saturation; only highlights are compressed.
 
     Args:
-        radiance: Linear radiance; the last axis is of three colors for "agx" and "aces".
+        radiance: Linear radiance; the last axis is of three colors for "agx", "aces" and "neutral".
         tone: The curve.
         stops: Exposure, such as `RelitScene.exposure` or `automatic_exposure` return it.
 
     Raises:
         TypeError: The radiance or `stops` does not consist of real numbers.
-        ValueError: The radiance holds NaN, has other than three colors for "agx" or "aces", `tone` is no curve's name,
-            or `stops` is not one number from -100 to 100.
+        ValueError: The radiance holds NaN, has other than three colors for "agx", "aces" or "neutral", `tone` is no
+            curve's name, or `stops` is not one number from -100 to 100.
     """
-    if tone in ("agx", "aces") and radiance.shape[-1:] != (3,):
+    if tone in _OF_COLORS and radiance.shape[-1:] != (3,):
         raise ValueError(f"the radiance must have three colors for the tone {tone!r}, got {list(radiance.shape)}")
     return _display(radiance, stops, tone=tone)
 

@@ -218,7 +218,7 @@ def test_bad_files_are_named_on_stderr_with_status_2(run, tmp_path, capsys, opti
         (["--turn", "0,inf"], "'--turn': must be a finite number, got inf"),
         (["--error", "1"], "'--error': must be a finite number above 0 and below 1, got 1"),
         (["--error", "0.1"], "--error needs --system planned, got separable"),
-        (["--tone", "reinhard"], "'reinhard' is not one of 'srgb', 'filmic', 'agx', 'aces'"),
+        (["--tone", "reinhard"], "'reinhard' is not one of 'srgb', 'filmic', 'agx', 'aces', 'neutral'"),
         (["--system", "planed"], "'planed' is not one of 'planned', 'lobe'"),
         (["--unknown"], "No such option '--unknown'"),
         (["--bounces", "few"], "a whole number of at least 0, or \"all\", got 'few'"),

@@ -117,9 +117,31 @@ def hable(color):
     return np.clip(curve(2 * np.asarray(color)) / curve(white), 0, 1)
 
 
-PUBLISHED = {"srgb": lambda color: np.clip(color, 0, 1), "filmic": hable, "agx": three_agx, "aces": three_aces}
+def three_neutral(color):
+    """NeutralToneMapping of three.js r187, by hand for one color at a time."""
+
+    def curve(color):
+        least = min(color)
+        color = color - (least - 6.25 * least * least if least < 0.08 else 0.04)
+        peak, start, distance = max(color), 0.8 - 0.04, 1 - (0.8 - 0.04)
+        if peak < start:
+            return color
+        new = 1 - distance * distance / (peak + distance - start)
+        pale = 1 - 1 / (0.15 * (peak - new) + 1)
+        return color * (new / peak) * (1 - pale) + new * pale
+
+    return np.array([curve(row) for row in np.asarray(color, float)])
+
+
+PUBLISHED = {
+    "srgb": lambda color: np.clip(color, 0, 1),
+    "filmic": hable,
+    "agx": three_agx,
+    "aces": three_aces,
+    "neutral": three_neutral,
+}
 # Matrices of AgX are printed with four digits there and inverted here.
-TONE_BOUND = {"srgb": 1e-6, "filmic": 1e-5, "agx": 1e-3, "aces": 1e-5}
+TONE_BOUND = {"srgb": 1e-6, "filmic": 1e-5, "agx": 1e-3, "aces": 1e-5, "neutral": 1e-5}
 
 
 @pytest.mark.parametrize("tone", tonemap.TONES)
@@ -143,7 +165,8 @@ def test_tones_map_anything_to_the_display_and_gray_to_increasing_gray(tone):
 
 
 def test_tones_are_refused_by_name_and_without_three_colors():
-    with pytest.raises(ValueError, match="tone must be one of srgb, filmic, agx, aces, got 'reinhard'"):
+    with pytest.raises(ValueError, match="tone must be one of srgb, filmic, agx, aces, neutral, got 'reinhard'"):
         tonemap.display(jnp.ones((2, 3)), tone="reinhard")
-    with pytest.raises(ValueError, match=r"must have three colors for the tone 'agx', got \[4, 4, 1\]"):
-        tonemap.display(jnp.ones((4, 4, 1)), tone="agx")
+    for tone in ("agx", "neutral"):
+        with pytest.raises(ValueError, match=rf"must have three colors for the tone '{tone}', got \[4, 4, 1\]"):
+            tonemap.display(jnp.ones((4, 4, 1)), tone=tone)

@@ -62,8 +62,9 @@ SHADES = """async ({ module, data, message, angle, radius, backs, size }) => {
   for (let frame = 0; frame < 8; frame++) pixels.learn(3000, true);
   const error = gl.getError(), slow = pixels.slow;
   pixels.close();
-  const listed = (data, there) => (there ? Array.from(data) : null), { blends } = piece;
-  return { error, slow, edge, first: listed(first, !blends), data: Array.from(read.data), saved: listed(saved, blends) };
+  const { blends } = piece, listed = (data, there) => (there ? Array.from(data) : null);
+  const data = listed(read.data, true);
+  return { error, slow, edge, data, first: listed(first, !blends), saved: listed(saved, blends) };
 }"""
 
 

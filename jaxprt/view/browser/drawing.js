@@ -26,12 +26,16 @@ vec3 agx(vec3 x){
   x = (((((15.5 * x - 40.14) * x + 31.96) * x - 6.868) * x + .4298) * x + .1191) * x - .00232;
   x = x * inverse(mat3(.899796956, .0871996192, .0130034249, .111420989, .875575586, .0130034249, .111420989, .0871996192, .801379392));
   return pow(max(x, 1e-6), vec3(2.2)) * back; }
+vec3 neutral(vec3 x){ float least = min(x.r, min(x.g, x.b));
+  x -= least < .08 ? least - 6.25 * least * least : .04;
+  float peak = max(max(x.r, max(x.g, x.b)), .76), high = 1. - .0576 / (peak - .52), share = 1. / (.15 * (peak - high) + 1.);
+  return mix(vec3(high), x * high / peak, share); }
 vec3 measured(vec3 x){ // the logarithm of luminance, in two bytes
   float code = clamp(log2(max(dot(x, vec3(.2126, .7152, .0722)), 1e-20)) * 255. / ${2 * MOST_STOPS}. + 127.5, 0., 255.);
   return vec3(floor(code) / 255., fract(code), 0.); }
 // The curves of jaxprt/image/tonemap.py. Matrices stand in rows, to the right of vectors.
 vec3 display(vec3 x){ if (encoded) return x; x = clamp(x * gain, 0., 1e6); if (tone < 0) return measured(x);
-  x = clamp(tone == 1 ? hable(2. * x) / hable(vec3(11.2)) : tone == 2 ? agx(x) : tone == 3 ? aces(x) : x, 0., 1.);
+  x = clamp(tone == 1 ? hable(2. * x) / hable(vec3(11.2)) : tone == 2 ? agx(x) : tone == 3 ? aces(x) : tone == 4 ? neutral(x) : x, 0., 1.);
   return mix(12.92 * x, 1.055 * pow(max(x, vec3(1e-6)), vec3(1. / 2.4)) - .055, step(.0031308, x)); }`;
 const MESH = `#version 300 es
 precision highp float; in vec3 c; out vec4 o; ${DISPLAY}
@@ -55,7 +59,7 @@ const STILL = `#version 300 es
 precision highp float; in vec2 at; out vec4 o; uniform sampler2D image; uniform float alpha; ${DISPLAY}
 void main(){ vec4 c = textureLod(image, vec2(at.x, 1. - at.y), 0.); o = vec4(display(c.rgb), alpha * c.a); }`;
 
-export const TONES = ["srgb", "filmic", "agx", "aces"];
+export const TONES = ["srgb", "filmic", "agx", "aces", "neutral"];
 
 const MOST_PIXELS = 2 ** 24; // of a picture that is saved
 const FADE = 200; // milliseconds in which a picture at rest appears
