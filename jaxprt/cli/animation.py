@@ -29,7 +29,7 @@ def animate(scene: RelitScene, view: View, folder: Path, *, frames: int, progres
     Returns:
         The files, one for each frame.
     """
-    light, result, stops = next(iter(view.lights.values())), [], None
+    light, result, stops = next(iter(view.lights.values())), [], view.stops
     folder.mkdir(parents=True, exist_ok=True)
     for number in tqdm.trange(frames, desc="animate", unit="frame", disable=not progress):
         turn = number / frames

@@ -21,6 +21,7 @@ from jaxprt.relit import RelitScene
 from jaxprt.relit.planning import Plan
 from jaxprt.scene.scene import centered
 from jaxprt.scene.sides import two_sided
+from jaxprt.view.state import State, load_state
 from jaxprt.visibility import blocks
 
 
@@ -43,7 +44,10 @@ class Shard(click.ParamType):
     options.FILES,
     Scene=options.SCENE,
     Light=options.LIGHT,
-    Camera=options.options_of(inputs.camera, azimuth=options.DEGREES, elevation=options.ELEVATION, size=options.PIXELS),
+    Camera=[
+        *options.options_of(inputs.camera, azimuth=options.DEGREES, elevation=options.ELEVATION, size=options.PIXELS),
+        {"state": (click.Path(exists=True, path_type=Path, dir_okay=False),)},
+    ],
     System=[
         options.systems(options.PLANNED, "One or several systems to compare.  [default: planned]", default=None),
         {"plan": (click.Path(exists=True, path_type=Path, file_okay=False),)},
@@ -76,6 +80,7 @@ def command(chosen: SimpleNamespace) -> options.Result:
       jaxprt relight scene.glb --system lobe --output shared --part 3/16
 
     Options:
+        state: Draw what the viewer showed when it saved this file, instead of --azimuth, --elevation, --turn and --tone.
         plan: Use the plan in this folder, written by `jaxprt plan`.
         animate: Write N pictures by each system with changing light, view and materials.
         table: Report errors of each system at several sizes, on N vertices of the first part.
@@ -126,12 +131,28 @@ def _systems(chosen: SimpleNamespace) -> tuple[str, ...]:
 
 def _view(chosen: SimpleNamespace, plan: Plan | None) -> View:
     """The scene, its lights, and a camera that sees everything except the ground."""
+    state = None if chosen.state is None else load_state(chosen.state)
+    if state is not None:
+        return _view_of(state, chosen, plan)
     scene = two_sided(centered(options.call(inputs.scene, chosen)))
-    size = chosen.light_size or (None if plan is None else plan.size)
-    lights = options.call(inputs.lights, chosen, light_size=size)
+    lights = options.call(inputs.lights, chosen, light_size=_light_size(chosen, plan))
     # The board of the embedded scene and the ground may extend beyond the picture.
     seen = scene.parts[:1] if not inputs.split_files(chosen.files)[0] else scene.parts[: -1 if chosen.ground else None]
     return View(scene, lights, options.call(inputs.camera, chosen, parts=seen), chosen.tone)
+
+
+def _view_of(state: State, chosen: SimpleNamespace, plan: Plan | None) -> View:
+    """What a viewer showed of the files."""
+    # Parts without a material are as in the viewer.
+    scene = options.call(inputs.scene, chosen, playable=True)
+    lights = options.call(inputs.lights, chosen, light_size=_light_size(chosen, plan), turn=(0.0,))
+    camera = state.camera(chosen.size).local(scene.parts[0].mesh.origin)
+    changed = two_sided(centered(state.changed(scene)))
+    return View(changed, {state.light: state.environment(lights)}, camera, state.tone, state.stops)
+
+
+def _light_size(chosen: SimpleNamespace, plan: Plan | None) -> int | None:
+    return chosen.light_size or (None if plan is None else plan.size)
 
 
 def _share(view: View, chosen: SimpleNamespace, systems: tuple[str, ...], plan: Plan | None) -> options.Result:

@@ -43,12 +43,13 @@ _TIMED = 1 << 10  # pixels along an edge of the largest picture whose view is ti
 
 
 class View(NamedTuple):
-    """The scene that a command relights, the lights by name, the camera, and the tone curve of `image.display`."""
+    """The scene that a command relights, the lights by name, the camera, and tone and stops of `image.display`."""
 
     scene: Scene
     lights: dict[str, Environment]
     camera: Camera
     tone: str = "srgb"
+    stops: float | None = None  # automatic
 
 
 class Truth(NamedTuple):
@@ -162,7 +163,7 @@ def compare(view: View, scenes: dict[str, RelitScene], output: Path) -> JsonObje
     uncovered = 1 - next(iter(direct.values())).coverage(view.camera)[..., None]
     for number, (name, light) in enumerate(view.lights.items()):
         right = jnp.asarray(truth.picture.color[number])
-        stops = image.automatic_exposure(right * cover)
+        stops = image.automatic_exposure(right * cover) if view.stops is None else jnp.asarray(view.stops)
         result[name] = {system: _errors(view, number, direct[system], drawn[system], truth) for system in drawn}
         for system in drawn:
             difference = jnp.abs(alike[system][number] - right)

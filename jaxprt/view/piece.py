@@ -39,7 +39,7 @@ const packed = Uint8Array.from(atob(text.textContent), (each) => each.charCodeAt
 text.remove();
 const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
 const {{ content, buffers }} = unpack(await new Response(stream).arrayBuffer());
-mount(document.getElementById("viewer"), answers(content, buffers));
+mount(document.getElementById("viewer"), answers(content, buffers), {{ addressed: true }});
 </script></body></html>
 """
 

@@ -40,7 +40,7 @@ async function ask(content, buffers = []) {
   if (!type.startsWith("application/octet-stream")) throw new Error((await response.text()) || response.status);
   return unpack(await response.arrayBuffer());
 }
-const close = mount(document.getElementById("viewer"), ask);
+const close = mount(document.getElementById("viewer"), ask, { addressed: true });
 window.addEventListener("pagehide", (event) => { if (!event.persisted) close(); });
 </script></body></html>
 """

@@ -308,6 +308,7 @@ class Session:
             "vertices": len(mesh.position),
             "triangles": len(mesh.face),
             "center": ((low + high) / 2).tolist(),
+            "origin": list(shown.origin),
             "radius": float(np.linalg.norm(high - low) / 2) or 1.0,
             "eye": np.asarray(camera.eye, float).tolist(),
             "target": np.asarray(camera.target, float).tolist(),

@@ -44,6 +44,7 @@ class Stages:
 
     Attributes:
         systems: Relit scene of each system, by name; before rays are traced, the scene without shadows.
+        origin: Origin of the scene in its files.
         lights: Environments of equal size.
         name: Names of the lights.
     """
@@ -51,6 +52,7 @@ class Stages:
     def __init__(self, systems: Mapping[str, RelitScene | Unshadowed], environments: Mapping[str, Environment]):
         """Stores the systems and lights. More lights may be added later."""
         # The browser draws in float32: positions, eyes and targets are relative to the scene's origin.
+        self.origin = next(iter(systems.values())).origin
         systems = {name: scene.centered() for name, scene in systems.items()}
         self.systems = systems
         self.name, self.lights = list(environments), list(environments.values())
@@ -74,7 +76,7 @@ class Stages:
 
     def unturned(self, number: int, lamps: tuple[Lamp, ...]) -> Environment:
         """A light with the lamps added, before rotation."""
-        return self._once("unturned", (number, lamps), lambda: _with(self.lights[number], lamps))
+        return self._once("unturned", (number, lamps), lambda: with_lamps(self.lights[number], lamps))
 
     def environment(self, look: Look) -> Environment:
         """The rotated light of a look."""
@@ -361,7 +363,7 @@ def _f0(material: TexturedMaterial) -> float:
     return 1.0 if ior == 0 else max(((ior - 1) / (ior + 1)) ** 2, 1e-6)
 
 
-def _with(light: Environment, lamps: tuple[Lamp, ...]) -> Environment:
+def with_lamps(light: Environment, lamps: tuple[Lamp, ...]) -> Environment:
     """A light with lamps added as disks."""
     for lamp in lamps:
         light = add_disk(light, np.asarray(lamp.direction), angle=lamp.angle, radiance=np.asarray(lamp.radiance))

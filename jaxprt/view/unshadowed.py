@@ -8,6 +8,7 @@ from jaxprt.relit.build import shaded
 from jaxprt.relit.channels import Shading
 from jaxprt.relit.recipes import Recipe
 from jaxprt.scene import Camera, Mesh, Scene, sides
+from jaxprt.scene.origin import Origin
 from jaxprt.scene.scene import centered, default_camera
 
 
@@ -17,10 +18,12 @@ class Unshadowed:
 
     Attributes:
         scene: The scene, with copies of faces whose backs are lit, and its origin at zero.
+        origin: Its origin before.
         shading: Mesh, BRDF and channel weights of each part.
     """
 
     scene: Scene
+    origin: Origin
     shading: Sequence[Shading]
 
     bounces = None
@@ -29,7 +32,7 @@ class Unshadowed:
     def of(cls, scene: Scene, recipe: Recipe) -> "Unshadowed":
         """A scene whose parts will be precomputed by one recipe."""
         near = centered(sides.two_sided(scene))
-        return cls(near, shaded(near.parts, [recipe] * len(near.parts)))
+        return cls(near, scene.parts[0].mesh.origin, shaded(near.parts, [recipe] * len(near.parts)))
 
     @cached_property
     def mesh(self) -> Mesh:

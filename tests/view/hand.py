@@ -16,7 +16,8 @@ class Hand:
     """A tab that shows a viewer."""
 
     def __init__(self, browser, url):
-        self.page = browser.new_page(viewport={"width": WIDTH, "height": 320})
+        # The camera stops where the hand lets it go.
+        self.page = browser.new_page(viewport={"width": WIDTH, "height": 320}, reduced_motion="reduce")
         self.page.set_default_timeout(180_000)  # two workers may take all cores; a picture at rest compiles for 40 s
         self.errors = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))

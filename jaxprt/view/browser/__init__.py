@@ -9,6 +9,7 @@ _FOLDER = pathlib.Path(__file__).parent
 _FILES = (
     "common",
     "camera",
+    "state",
     "shading",
     "harmonics",
     "lights",

@@ -4,13 +4,16 @@ import { add, clamp, cross, dot, unit } from "./common.js";
 
 export class Camera {
   constructor(scene) {
-    const offset = add(scene.eye, scene.target, -1);
-    this.target = [...scene.target];
+    this.radius = scene.radius;
+    this.restore(scene.eye, scene.target, scene.field_of_view);
+  }
+  restore(eye, target, angle) {
+    const offset = add(eye, target, -1);
+    this.target = [...target];
     this.distance = Math.hypot(...offset);
     this.azimuth = Math.atan2(offset[0], offset[2]);
     this.elevation = Math.asin(clamp(offset[1] / this.distance, -1, 1));
-    this.angle = scene.field_of_view;
-    this.radius = scene.radius;
+    this.angle = angle;
   }
   get back() {
     const c = Math.cos(this.elevation);
@@ -22,11 +25,28 @@ export class Camera {
     this.azimuth -= dx;
     this.elevation = clamp(this.elevation + dy, -1.55, 1.55);
   }
-  pan(dx, dy) {
+  pan(dx, dy) { // of the height of the picture
     const [x, y] = this.axes, step = 2 * this.distance * Math.tan(this.angle / 2);
     this.target = add(add(this.target, x, -dx * step), y, dy * step);
   }
-  zoom(factor) { this.distance = clamp(this.distance * factor, 1e-3 * this.radius, 1e3 * this.radius); }
+  // What is seen at a place, to the right and down from the middle in heights of the picture, stays there, as far away as the target.
+  zoom(factor, [x, y] = [0, 0]) {
+    const before = this.distance;
+    this.distance = clamp(before * factor, 1e-3 * this.radius, 1e3 * this.radius);
+    const share = 1 - before / this.distance;
+    this.pan(x * share, y * share);
+  }
+  // Another angle of view, at the distance at which the target is as large as before.
+  widen(angle) {
+    this.distance *= Math.tan(this.angle / 2) / Math.tan(angle / 2);
+    this.angle = angle;
+  }
+  // Looks at a box from where it looks now, so that a sphere around it fills the picture.
+  frame(low, high, aspect) {
+    this.target = add(low, high).map((x) => x / 2);
+    const half = Math.min(this.angle / 2, Math.atan(aspect * Math.tan(this.angle / 2)));
+    this.distance = clamp(Math.hypot(...add(high, low, -1)) / 2 / Math.sin(half), 1e-3 * this.radius, 1e3 * this.radius);
+  }
   ray(aspect) { // columns: to the right, up and forward, for coordinates from -1 to 1
     const [x, y, z] = this.axes, t = Math.tan(this.angle / 2);
     return [...x.map((v) => v * t * aspect), ...y.map((v) => v * t), ...z.map((v) => -v)];

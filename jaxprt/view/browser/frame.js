@@ -9,6 +9,8 @@ const NARROW = 480; // pixels of the frame up to which the panel lies below the 
 // Paths of 16 x 16.
 const ICONS = {
   picture: "M2 5h3l1.5-2h3L11 5h3v8H2zM8 11.2a2.4 2.4 0 1 0 0-4.8 2.4 2.4 0 0 0 0 4.8z",
+  undo: "M6 3 2.5 6.5 6 10M2.5 6.5H9a4 4 0 0 1 0 7H7",
+  redo: "M10 3l3.5 3.5L10 10M13.5 6.5H7a4 4 0 0 0 0 7h2",
   reset: "M3 8a5 5 0 1 0 1.6-3.7M3 2.5v3h3",
   theme: "M8 13.5a5.5 5.5 0 1 0 0-11zM8 2.5a5.5 5.5 0 0 0 0 11",
   help: "M5.8 6a2.2 2.2 0 1 1 3.2 2c-.7.4-1 .8-1 1.6M8 12.2v.1",
@@ -46,6 +48,7 @@ export function frameOf(shadow, on) {
   const toggleHelp = () => { help.hidden = !help.hidden; started(); if (help.hidden) canvas.focus(); else help.querySelector("button").focus(); };
   help.querySelector("button").onclick = toggleHelp;
   tool("picture", "save a picture", () => dialog.open());
+  const [undo, redo] = [tool("undo", "undo (Z)", () => on.undo(-1)), tool("redo", "redo (Y)", () => on.undo(1))];
   tool("reset", "reset the view, the light and the materials (R)", on.reset);
   tool("theme", "dark or light", () => theme(!frame.classList.contains("light")));
   tool("help", "help (H)", toggleHelp);
@@ -73,6 +76,8 @@ export function frameOf(shadow, on) {
   return {
     frame, canvas, panel, line, help, toggleHelp, dialog,
     unfold() { fold(false); },
+    // Whether there is something to undo, and to redo.
+    steps(back, ahead) { [undo.disabled, redo.disabled] = [!back, !ahead]; },
     tell(text) { told.textContent = text; told.hidden = !text; },
     // What is waited for, and how far it is, from 0 to 1; null where nobody knows. No text: nothing is.
     busy(text, part = null) {

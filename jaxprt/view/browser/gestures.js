@@ -2,6 +2,10 @@
 
 import { clamp } from "./common.js";
 
+const GLIDE = 130; // milliseconds in which a turn that was let go falls to a third of its speed
+const STOPPED = 60; // milliseconds without a move after which the hand had stopped
+const SLOWEST = 2e-5; // radians a millisecond
+
 const keys = (text) => text.split(" ").map((key) => `<kbd>${key}</kbd>`).join(" ");
 export const HINT = {
   mouse: `drag to orbit, wheel to zoom, ${keys("Shift")}-drag to turn the light, ${keys("H")} for all keys`,
@@ -10,12 +14,13 @@ export const HINT = {
 export const HELP = [
   [`drag, one finger, ${keys("← → ↑ ↓")}`, "orbit"],
   [`right drag, ${keys("Ctrl")}-drag, two fingers, ${keys("Shift")} ${keys("← → ↑ ↓")}`, "pan"],
-  [`wheel, pinch, ${keys("+ -")}`, "zoom"],
+  [`wheel, pinch, ${keys("+ -")}`, "zoom, to where the pointer is"],
+  [keys("F"), "show all of the part that was opened last, or of the scene"],
   ["double-click, double tap", "look at a point, and open its material"],
   [`${keys("Alt")}-click`, "open the material of a part"],
   [`${keys("Shift")}-drag, ${keys("[ ]")}`, "turn the light"],
   [keys("L"), "next light"],
-  ["drop a file", "an HDR or EXR file as another light"],
+  ["drop a file", "an HDR or EXR file as another light, or a saved state"],
   [keys("C"), "remove the suns"],
   [keys(", ."), "exposure"],
   [keys("A"), "automatic exposure"],
@@ -24,6 +29,7 @@ export const HELP = [
   [keys("S"), "next system"],
   [keys("P"), "fine picture at rest"],
   [keys("E"), "exact picture at rest"],
+  [`${keys("Z")}, ${keys("Y")}`, "undo, redo"],
   [keys("R"), "reset"],
   [keys("H"), "this help"],
 ];
@@ -32,6 +38,24 @@ export function gestures(canvas, frame, on) {
   const points = new Map();
   let pinch = null;
   const place = (event) => { const box = canvas.getBoundingClientRect(); return [(2 * (event.clientX - box.left)) / box.width - 1, 1 - (2 * (event.clientY - box.top)) / box.height]; };
+  const aside = (event) => { const box = canvas.getBoundingClientRect(); return [(event.clientX - box.left - box.width / 2) / (box.height || 1), (event.clientY - box.top - box.height / 2) / (box.height || 1)]; };
+  // A turn of the camera goes on for a moment after the hand has let go, unless the system asks for less motion.
+  let swing = null;
+  const calm = matchMedia("(prefers-reduced-motion: reduce)");
+  const hold = () => { if (swing) cancelAnimationFrame(swing.frame); swing = null; };
+  const glide = (now) => {
+    const passed = now - swing.at, slower = Math.exp(-passed / GLIDE);
+    on.camera.orbit(swing.dx * passed, swing.dy * passed);
+    swing = Math.hypot(swing.dx, swing.dy) * slower > SLOWEST ? { dx: swing.dx * slower, dy: swing.dy * slower, at: now, frame: requestAnimationFrame(glide) } : null;
+    on.moved();
+  };
+  const release = (event) => {
+    points.delete(event.pointerId);
+    pinch = null;
+    if (!speed || event.timeStamp - speed.at > STOPPED || calm.matches) return;
+    swing = { ...speed, at: performance.now(), frame: requestAnimationFrame(glide) };
+  };
+  let speed = null; // of the camera, in radians a millisecond
   const spot = (event) => [event.clientX, event.clientY];
   const middle = () => { const [a, b] = [...points.values()]; return { at: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], apart: Math.hypot(a[0] - b[0], a[1] - b[1]) || 1 }; };
   const listen = {
@@ -39,6 +63,8 @@ export function gestures(canvas, frame, on) {
     pointerdown(event) {
       if (!on.camera) return;
       canvas.focus({ preventScroll: true });
+      hold();
+      speed = null;
       if (event.altKey) return on.pick(...place(event));
       canvas.setPointerCapture(event.pointerId);
       points.set(event.pointerId, spot(event));
@@ -49,18 +75,24 @@ export function gestures(canvas, frame, on) {
       if (!from || !on.camera) return;
       const to = spot(event), [dx, dy] = [to[0] - from[0], to[1] - from[1]], height = canvas.clientHeight || 1;
       points.set(event.pointerId, to);
+      const before = speed;
+      speed = null;
       if (points.size === 2 && pinch) {
         const now = middle();
-        on.camera.zoom(pinch.apart / now.apart);
+        on.camera.zoom(pinch.apart / now.apart, aside({ clientX: now.at[0], clientY: now.at[1] }));
         on.camera.pan((now.at[0] - pinch.at[0]) / height, (now.at[1] - pinch.at[1]) / height);
         pinch = now;
       } else if (event.shiftKey) return on.set({ turn: on.state.turn + 0.01 * dx });
       else if (event.ctrlKey || event.buttons & 2) on.camera.pan(dx / height, dy / height);
-      else on.camera.orbit(0.01 * dx, 0.01 * dy);
+      else {
+        on.camera.orbit(0.01 * dx, 0.01 * dy);
+        const passed = Math.max(1, event.timeStamp - (before?.at ?? event.timeStamp - 16));
+        speed = { dx: (0.01 * dx) / passed, dy: (0.01 * dy) / passed, at: event.timeStamp };
+      }
       on.moved();
     },
-    pointerup(event) { points.delete(event.pointerId); pinch = null; },
-    pointercancel(event) { points.delete(event.pointerId); pinch = null; },
+    pointerup: release,
+    pointercancel: release,
     dblclick(event) {
       if (!on.camera) return;
       on.lookAt(...place(event));
@@ -68,15 +100,18 @@ export function gestures(canvas, frame, on) {
     wheel(event) {
       if (!on.camera) return;
       event.preventDefault();
-      on.camera.zoom(Math.exp(0.001 * clamp(event.deltaY, -300, 300)));
+      hold();
+      on.camera.zoom(Math.exp(0.001 * clamp(event.deltaY, -300, 300)), aside(event));
       on.moved();
     },
   };
   // Letters act wherever nothing is typed; arrows, + and - on the picture alone.
   const typed = (event) => {
     const from = event.composedPath()[0], elsewhere = from !== canvas;
-    if (!on.camera || event.altKey || event.metaKey || event.ctrlKey || from.closest("dialog, input, select")) return;
+    const taken = event.key.toLowerCase() === "z" || event.key.toLowerCase() === "y"; // keys of undo, which other programs have with Ctrl
+    if (!on.camera || event.altKey || ((event.metaKey || event.ctrlKey) && !taken) || from.closest("dialog, input:not([type=range]), select")) return;
     if (elsewhere && (event.key.length > 1 || "+-= ".includes(event.key)) && !(event.key === "Escape" && !on.help.hidden)) return;
+    hold();
     if (!key(event, on)) return;
     event.preventDefault();
     event.stopPropagation();
@@ -85,7 +120,14 @@ export function gestures(canvas, frame, on) {
   frame.addEventListener("keydown", typed);
   frame.addEventListener("dragover", (event) => event.preventDefault());
   frame.addEventListener("drop", (event) => { event.preventDefault(); if (on.camera && event.dataTransfer.files[0]) on.drop(event.dataTransfer.files[0]); });
-  return () => { for (const [name, each] of Object.entries(listen)) canvas.removeEventListener(name, each); frame.removeEventListener("keydown", typed); };
+  return {
+    get held() { return points.size > 0 || swing !== null; },
+    close() {
+      hold();
+      for (const [name, each] of Object.entries(listen)) canvas.removeEventListener(name, each);
+      frame.removeEventListener("keydown", typed);
+    },
+  };
 }
 
 function key(event, on) {
@@ -104,7 +146,7 @@ function key(event, on) {
       l: () => scene.lights.length > 1 && on.set({ light: (state.light + 1) % scene.lights.length }),
       s: () => names.length > 1 && on.set({ system: next, bounces: state.bounces && scene.systems[next].bounces }),
       b: () => scene.systems[state.system].bounces && on.set({ bounces: !state.bounces }), g: () => on.set({ background: !state.background }),
-      p: () => on.set({ still: !state.still }), e: () => on.set({ exact: !state.exact }), c: () => state.lamps.length && on.set({ lamps: [] }), r: () => on.reset(),
+      p: () => on.set({ still: !state.still }), e: () => on.set({ exact: !state.exact }), z: () => on.undo(event.shiftKey ? 1 : -1), y: () => on.undo(1), f: () => on.frame(), c: () => state.lamps.length && on.set({ lamps: [] }), r: () => on.reset(),
       a: () => on.automatic(true), h: () => on.toggleHelp(), escape: () => on.help.hidden || on.toggleHelp(),
     }[event.key.toLowerCase()];
     if (!act) return false;

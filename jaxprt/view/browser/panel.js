@@ -40,7 +40,7 @@ function slider(parent, text, { low, high, step, at = (x) => x, of = (x) => x, d
   return node;
 }
 
-export function panelOf(panel, scene, state, { set, expose, automatic, map, moved, open }) {
+export function panelOf(panel, scene, state, { set, expose, automatic, map, moved, widen, camera, open }) {
   panel.textContent = "";
   const choice = (parent, text, names, pick) => {
     const node = element("select", row(parent, text));
@@ -81,6 +81,7 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
   const auto = box(viewPart, "automatic exposure", "auto");
   auto[1].onchange = () => automatic(auto[1].checked);
   const tone = choice(viewPart, "tone curve", TONES, (i) => map(TONES[i]));
+  const wide = slider(viewPart, "view angle °", { low: 5, high: 120, step: 1, digits: 1 }, (degrees) => widen(degrees * DEGREE));
   const boxes = [auto, box(viewPart, "background", "background")];
   if (scene.rests.includes("still")) boxes.push(box(viewPart, "fine picture at rest", "still"));
   if (scene.rests.includes("exact")) boxes.push(box(viewPart, "exact picture at rest", "exact"));
@@ -103,6 +104,7 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
       turn.show(sides.wrap(state.turn / DEGREE));
       if (system) system.value = names.indexOf(state.system);
       exposure.show(state.stops);
+      wide.show(camera().angle / DEGREE);
       tone.value = TONES.indexOf(state.tone);
       clear.disabled = !state.lamps.length;
       for (const [key, each] of boxes) each.checked = state[key];

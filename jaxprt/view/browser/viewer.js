@@ -3,6 +3,7 @@
 
 import { add, clamp, decompressed, drawnSize, inflate, unit } from "./common.js";
 import { Camera, meet } from "./camera.js";
+import { History, restored, written } from "./state.js";
 import { Drawing } from "./drawing.js";
 import { Piece } from "./piece.js";
 import { Pixels } from "./pixels.js";
@@ -16,11 +17,12 @@ const SKY_ROWS = 1024; // of the picture of a light at rest, if its file has so 
 const TRIES = 3; // answers of Python until their time counts: the first ones wait for compilers
 const SLOW = 500; // milliseconds of a whole picture from which on a coarse one comes first
 
-export function mount(root, ask) {
+// Shows what `ask` answers. A page of the viewer alone has its state in its address.
+export function mount(root, ask, { addressed = false } = {}) {
   const shadow = root.shadowRoot ?? root.attachShadow({ mode: "open" });
   shadow.textContent = "";
   root.dataset.lmSuppressShortcuts = "true"; // JupyterLab leaves the keys to the viewer
-  const view = frameOf(shadow, { reset: () => scene && reset(), picture: (size) => picture(size) });
+  const view = frameOf(shadow, { reset: () => scene && reset(), undo: (by) => scene && past.step(by), picture: (size) => picture(size) });
   const { frame, canvas, panel, line, help, tell, busy } = view;
   const state = { system: "", light: 0, turn: 0, lamps: [], stops: 0, auto: true, tone: "srgb", background: true, bounces: false, still: true, exact: false, materials: {} };
   const stats = (canvas.stats = { sent: 0, got: 0, errors: 0, stills: 0, coarse: 0, draws: 0, sky: 0, bytes: 0, seq: 0, shown: -1, trip: 0 });
@@ -64,6 +66,8 @@ export function mount(root, ask) {
   // Anything that changes the picture: the newest state is asked for as soon as the last answer has come.
   const moved = () => {
     if (!scene) return;
+    past.changed();
+    notice = "";
     seq++;
     stats.seq = seq;
     drawing.dropStills(0);
@@ -72,6 +76,7 @@ export function mount(root, ask) {
     look();
   };
   let looked = 0; // answers of Python
+  let notice = ""; // what stays said until the next change
   // The GPU's scene: what it holds of a system, asked for once. Other states have their colors from Python.
   let gpu = null, asked = "", lacking = "";
   const page = async (from = scene) => {
@@ -109,7 +114,7 @@ export function mount(root, ask) {
       drawing.unexposed = true;
     }
     Object.assign(stats, { got: stats.got + 1, shown: seq });
-    tell("");
+    tell(notice);
     describe();
     redraw();
     sky();
@@ -148,7 +153,7 @@ export function mount(root, ask) {
         stats.got++;
         stats.bytes += sent;
         stats.shown = Math.max(stats.shown, content.seq); // the GPU may have shown a newer state
-        if (content.seq === seq) tell("");
+        if (content.seq === seq) tell(notice);
         const rate = framed ? 1000 / (performance.now() - framed) : 0;
         framed = performance.now();
         if (!drawing.gpu) status(content.ms, rate, sent);
@@ -237,23 +242,62 @@ export function mount(root, ask) {
   const automatic = (auto) => {
     [state.auto, exposed] = [auto, null];
     controls?.show();
+    past.changed();
     if (auto) moved();
   };
   const expose = (stops) => {
     [state.auto, state.stops] = [false, clamp(stops, -20, 20)];
     controls?.show();
+    past.changed();
     if (long) moved(); else redraw();
   };
   const map = (tone) => {
     state.tone = tone;
     controls?.show();
+    past.changed();
     if (long) moved(); else redraw();
   };
+  const widen = (angle) => { camera.widen(angle); moved(); };
+  // Shows all of the part that was opened last, or of the scene.
+  const frameAll = () => {
+    const low = [Infinity, Infinity, Infinity], high = low.map((x) => -x), count = scene.position.length / 3;
+    let first = 0, last = count;
+    if (opened) {
+      const number = scene.parts.findIndex((part) => part.name === opened), counts = scene.parts.map((part) => part.vertices);
+      first = counts.slice(0, number).reduce((total, each) => total + each, 0);
+      last = first + (counts[number] ?? count);
+    }
+    for (let i = 3 * first; i < 3 * last; i++) {
+      low[i % 3] = Math.min(low[i % 3], scene.position[i]);
+      high[i % 3] = Math.max(high[i % 3], scene.position[i]);
+    }
+    camera.frame(low, high, canvas.clientWidth / (canvas.clientHeight || 1));
+    moved();
+  };
+  // The states that the user has gone through, of which the address holds the present one.
+  const give = (text) => {
+    const lacking = restored(text, state, camera, scene);
+    exposed = null;
+    controls?.show();
+    moved();
+    tell((notice = lacking));
+  };
+  const past = new History(() => !hands.held && written(state, camera, scene, canvas.width / canvas.height), give, (text) => {
+    view.steps(past.at > 0, past.at < past.states.length - 1);
+    if (addressed) history.replaceState(null, "", `#${encodeURIComponent(text)}`);
+  });
+  const arrived = () => {
+    try { give(decodeURIComponent(location.hash.slice(1))); } catch (error) { tell(`the address holds no state: ${error.message}`); }
+  };
+  if (addressed) window.addEventListener("hashchange", arrived);
   const took = ({ lights, light }, buffers) => { // texels of the last ones, from a number on
     scene.lights = lights;
     if (gpu) buffers.forEach((each, i) => { gpu.piece.lights[light + i] = new Float32Array(each.buffer, each.byteOffset, each.byteLength / 4); });
   };
   const drop = async (file) => {
+    if (/\.json$/i.test(file.name)) {
+      try { return give(await file.text()); } catch (error) { return tell(`${file.name}: ${error.message}`); }
+    }
     if (file.size > 2 ** 29) return tell(`${file.name} must have at most 512 MiB, and has ${Math.ceil(file.size / 2 ** 20)}`);
     try {
       const sent = ask({ kind: "drop", name: file.name }, [await file.arrayBuffer()]);
@@ -273,8 +317,10 @@ export function mount(root, ask) {
     let vertex = scene.face[3 * triangle];
     return { point: add(origin, way, distance), part: scene.parts.find((part) => (vertex -= part.vertices) < 0) };
   };
+  let opened = ""; // the name of the part whose controls were opened last
   const pick = (x, y) => {
     const part = seen(x, y)?.part;
+    opened = part?.name ?? "";
     if (!part) return;
     if (controls.pick(part.name)) view.unfold();
     tell(part.free ? "" : `the material of ${part.name} cannot change here`);
@@ -282,6 +328,7 @@ export function mount(root, ask) {
   const lookAt = (x, y) => {
     const found = seen(x, y);
     if (!found) return;
+    opened = found.part?.name ?? "";
     if (found.part?.free) controls.pick(found.part.name);
     camera.target = found.point;
     moved();
@@ -350,15 +397,17 @@ export function mount(root, ask) {
       if (bouncing) state.bounces = false;
       scene = Object.assign(scene ?? {}, loaded);
       [bytes, exposed] = [null, null]; // an automatic exposure is found for each better scene
+      const first = !camera;
       camera ??= new Camera(scene);
       drawing.setMesh(scene.position, scene.face, scene.backs);
       if (controlled !== panelled) {
-        controls = panelOf(panel, scene, state, { set, expose, automatic, map, moved, open: drop });
+        controls = panelOf(panel, scene, state, { set, expose, automatic, map, moved, widen, camera: () => camera, open: drop });
         if (root.parentElement === document.body && document.activeElement === document.body) canvas.focus({ preventScroll: true }); // a page of the viewer alone: keys work at once
         [panelled, skyKey] = [controlled, {}];
       }
       controls.show();
       resize();
+      if (first && addressed && location.hash.length > 1) arrived();
       moved();
     } catch (error) {
       tell(`no answer from Python: ${error.message}`);
@@ -369,7 +418,7 @@ export function mount(root, ask) {
   };
   try { drawing = new Drawing(canvas); } catch (error) { tell(error.message); return () => {}; }
   drawing.exposed = found;
-  const hands = gestures(canvas, frame, { get camera() { return camera; }, state, scene: () => scene, set, expose, automatic, moved, drop, reset, lookAt, pick, help, toggleHelp: view.toggleHelp });
+  const hands = gestures(canvas, frame, { get camera() { return camera; }, state, scene: () => scene, set, expose, automatic, moved, drop, reset, lookAt, pick, undo: (by) => past.step(by), frame: frameAll, help, toggleHelp: view.toggleHelp });
   frame.addEventListener("theme", () => controls?.show());
   canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); if (!closed) tell("the graphics context was lost; it comes back by itself"); });
   canvas.addEventListener("webglcontextrestored", () => {
@@ -383,7 +432,7 @@ export function mount(root, ask) {
   canvas.state = state;
   canvas.camera = () => camera;
   start();
-  return () => { closed = true; unfollow(); watch.disconnect(); view.close(); hands(); clearTimeout(stillTimer); drawing.close(); };
+  return () => { closed = true; unfollow(); past.close(); if (addressed) window.removeEventListener("hashchange", arrived); watch.disconnect(); view.close(); hands.close(); clearTimeout(stillTimer); drawing.close(); };
 }
 
 // A picture that the graphics card draws, as a PNG file.
