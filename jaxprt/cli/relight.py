@@ -80,7 +80,7 @@ def command(chosen: SimpleNamespace) -> options.Result:
       jaxprt relight scene.glb --system lobe --output shared --part 3/16
 
     Options:
-        state: Draw what the viewer showed when it saved this file, instead of --azimuth, --elevation, --turn and --tone.
+        state: Draw what the viewer showed when it saved this file, without --azimuth, --elevation, --turn and --tone.
         plan: Use the plan in this folder, written by `jaxprt plan`.
         animate: Write N pictures by each system with changing light, view and materials.
         table: Report errors of each system at several sizes, on N vertices of the first part.

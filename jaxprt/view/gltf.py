@@ -103,7 +103,7 @@ def export_gltf(
     path: str | os.PathLike,
     *,
     environments: Mapping[str, Environment] | None = None,
-    degree: int = DEGREE,
+    degree: int | None = DEGREE,
 ) -> None:
     """Writes a scene as binary glTF with its shadowed transfer in vertex attributes, for shaders of other programs.
 
@@ -124,7 +124,7 @@ def export_gltf(
         path: The file, `*.glb`.
         environments: Dictionary from names to lights whose coefficients are stored in the file; none if None.
         degree: Highest degree of the harmonics, from 0 to 5: 2 has 9 coefficients, 3 has 16. Systems of pages have at
-            most the degree of their transport.
+            most the degree of their transport. None writes the scene alone, without transfer, of any system.
 
     Raises:
         TypeError: `scene` is not a relit scene, or `environments` holds something other than lights.
@@ -135,7 +135,8 @@ def export_gltf(
     Reference: Khronos, glTF 2.0 specification, section 3.7.2.1 on attributes of applications; Kautz et al. 2002.
     """
     require.kind("the scene", scene, RelitScene, source="jaxprt.precompute")
-    require.count("degree", degree, least=0, most=MOST_DEGREE)
+    if degree is not None:
+        require.count("degree", degree, least=0, most=MOST_DEGREE)
     path = outputs.target(path, ".glb")
     if environments is not None and not isinstance(environments, Mapping):
         got = require.shown(environments)
@@ -147,12 +148,16 @@ def export_gltf(
     file = _File()
     for number, (part, shading) in enumerate(zip(scene.scene.parts, scene.shading, strict=True)):
         attributes, material = _attributes(file, part), _material(file, part, shading)
-        transfer = _transfer(scene, number, degree)
-        for first in range(0, transfer.shape[1], 4):
-            column = np.round(_SHORT * transfer[:, first : first + 4])
-            attributes[f"_PRT_{first // 4}"] = file.array(column, "<i2", normalized=True)
+        if degree is not None:
+            transfer = _transfer(scene, number, degree)
+            for first in range(0, transfer.shape[1], 4):
+                column = np.round(_SHORT * transfer[:, first : first + 4])
+                attributes[f"_PRT_{first // 4}"] = file.array(column, "<i2", normalized=True)
         attributes |= material.pop("coordinates")
         _add_node(file, part, part.name, attributes, file.add("materials", material | {"name": part.name}))
+    if degree is None:
+        outputs.write(path, file.content({}, "scene"))
+        return
     coefficients = {name: _light(light, degree).tolist() for name, light in lights.items()}
     prt = {
         "degree": degree,

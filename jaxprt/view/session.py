@@ -13,6 +13,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -29,6 +30,7 @@ from jaxprt.scene.mesh import bounds
 from jaxprt.systems import protocol
 from jaxprt.view import messages, stages
 from jaxprt.view.content import light_texels, mip_edges, page_content, unshadowed_content
+from jaxprt.view.gltf import export_gltf
 from jaxprt.view.messages import Lamp, Look, Message, Reply
 from jaxprt.view.progress import COMPILING, EndedError, Progress
 from jaxprt.view.reduced import PageScene
@@ -230,6 +232,7 @@ class Session:
             "still": self._still,
             "exact": self._exact,
             "picture": self._picture,
+            "glb": self._glb,
             "sky": self._sky,
             "drop": self._drop,
             "lights": self._lights,
@@ -399,20 +402,38 @@ class Session:
         return Reply({"kind": "still", "seq": seq, "scale": scale, "exact": True, **told, **size}, [data, *alpha])
 
     def _picture(self, message: Message, buffers: Sequence[bytes]) -> Reply:
-        """A PNG file of a picture of any size. Newer looks do not abandon it."""
+        """A PNG or EXR file of a picture of any size. Newer looks do not abandon it."""
         shown, look, _ = self._parse(message)
         width, height = (int(messages.number(message, key, 1.0, _LARGEST_FILE)) for key in ("width", "height"))
         if width * height > _MOST_PIXELS:
             raise ValueError(f"a picture must have at most {_MOST_PIXELS} pixels, got {width} x {height}")
-        options = {"samples": 16 if width * height <= _FINE_PIXELS else 4, "between": self._until_ended}
+        samples = 16 if width * height <= _FINE_PIXELS else 4
+        if "samples" in message:
+            samples = int(messages.number(message, "samples", 1.0, 16.0))
+        options = {"samples": samples, "between": self._until_ended}
         clear = messages.truth(message, "transparent")
         picture = (shown.cutout if clear else shown.picture)(look, width, height, **options)
+        color, alpha = picture[..., :3], picture[..., 3:]
         exposure = {"stops": _stops(message) or 0.0, "tone": _tone(message)}
-        pixels = [messages.displayed(picture[..., :3], **exposure), picture[..., 3:]]
         with tempfile.TemporaryDirectory() as folder:
-            path = pathlib.Path(folder) / "picture.png"
-            files.write_png(path, np.concatenate(pixels, -1))
+            path = pathlib.Path(folder) / ("picture.exr" if _is_exr(message) else "picture.png")
+            if _is_exr(message):  # colors of EXR files are multiplied by alpha
+                files.write_exr(path, np.concatenate([color * alpha if clear else color, alpha], -1))
+            else:
+                files.write_png(path, np.concatenate([messages.displayed(color, **exposure), alpha], -1))
             return Reply({"kind": "picture", "width": width, "height": height}, [path.read_bytes()])
+
+    def _glb(self, message: Message, buffers: Sequence[bytes]) -> Reply:
+        """The scene with the materials of the look, as binary glTF."""
+        shown, look, _ = self._parse(message)
+        scene = shown.changed_scene(look)
+        meshes = [dataclasses.replace(part.mesh, origin=shown.origin) for part in scene.parts]
+        parts = [dataclasses.replace(part, mesh=mesh) for part, mesh in zip(scene.parts, meshes, strict=True)]
+        changed = eqx.tree_at(lambda relit: relit.scene.parts, shown.system(look), parts)
+        with tempfile.TemporaryDirectory() as folder:
+            path = pathlib.Path(folder) / "scene.glb"
+            export_gltf(changed, path, degree=None)
+            return Reply({"kind": "glb"}, [path.read_bytes()])
 
     def _until_ended(self) -> None:
         if self._ended:
@@ -506,6 +527,13 @@ def _size(message: Message) -> tuple[int, int, bool]:
 
 def _stops(message: Message) -> float | None:
     return None if message.get("stops") is None else messages.number(message, "stops", -60.0, 60.0)
+
+
+def _is_exr(message: Message) -> bool:
+    name = message.get("format", "png")
+    if name not in ("png", "exr"):
+        raise ValueError(f"the format must be png or exr, got {str(name)[:80]!r}")
+    return name == "exr"
 
 
 def _tone(message: Message) -> str:

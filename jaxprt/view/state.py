@@ -68,9 +68,9 @@ class State(NamedTuple):
         Args:
             height: Rows of its pictures.
         """
-        width, (eye, target) = max(1, round(self.aspect * height)), (self.look.eye, self.look.target)
-        places = (np.array(place, float) for place in (eye, target))
-        return Camera(*places, [0.0, 1.0, 0.0], self.look.field_of_view, width, height)
+        width, up = max(1, round(self.aspect * height)), [0.0, 1.0, 0.0]
+        eye, target = (np.array(place, float) for place in (self.look.eye, self.look.target))
+        return Camera(eye, target, up, self.look.field_of_view, width, height)
 
 
 def load_state(path: str | os.PathLike) -> State:

@@ -17,6 +17,7 @@ from jaxprt import image, view
 from jaxprt.image.pixels import seen_from_front
 from jaxprt.scene import Camera, Part, Scene, TexturedMaterial, builtin, sides
 from jaxprt.scene.environment import rotate
+from jaxprt.sphere import cubemap
 from jaxprt.view import Server, Session, stages
 from tests.view.hand import CANVAS, Hand
 
@@ -134,7 +135,7 @@ def test_every_control_has_a_name_and_is_reached_by_keys(hand):
         hand.page.keyboard.press("Tab")
         reached.add(hand.page.evaluate(FOCUSED))
     for name in (
-        "save a picture",
+        "save a picture, a video or the state",
         "reset the view, the light and the materials (R)",
         "rotation °",
         "rotation °, typed",
@@ -185,7 +186,7 @@ def test_typed_numbers_change_the_scene_and_the_sliders(hand):
 def test_a_picture_at_rest_has_no_background_where_there_is_none(hand, systems, lights):
     hand.page.locator("canvas.canvas").focus()
     hand.page.evaluate(f"() => ({CANVAS}).camera().zoom(2)")
-    hand.page.keyboard.press("g")
+    hand.page.get_by_label("background", exact=True).select_option(label="none")
     hand.still()
     state, camera, shown = hand.state(), hand.camera(), hand.pixels()
     height, width = shown.shape[:2]
@@ -280,6 +281,87 @@ def test_keys_that_change_nothing_leave_the_picture_at_rest(browser, systems, li
     server.close()
 
 
+def test_the_background_is_the_light_blurred_or_a_color(hand, lights):
+    hand.page.evaluate(f"() => ({CANVAS}).camera().zoom(2)")
+    hand.page.get_by_label("background", exact=True).select_option(label="color")
+    hand.page.get_by_label("its color").fill("#336699")
+    hand.still()
+    cover = hand.pixels()[:60, :60]  # only the background is there
+    np.testing.assert_allclose(cover, np.broadcast_to([0.2, 0.4, 0.6], cover.shape), atol=1 / 255)
+    hand.page.get_by_label("background", exact=True).select_option(label="blurred light")
+    hand.still()
+    camera, shown = hand.camera(), hand.pixels()
+    height, width = shown.shape[:2]
+    forward = np.subtract(camera["target"], camera["eye"])
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 1, 0])
+    right /= np.linalg.norm(right)
+    reach, place = np.tan(camera["angle"] / 2), np.arange(0, 60, 20) + 0.5
+    across = reach * (2 * place / width - 1)[None, :, None] * width / height * right
+    upward = reach * (1 - 2 * place / height)[:, None, None] * np.cross(right, forward)
+    ways = (forward + across + upward).reshape(-1, 3)
+    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+    radiance = np.asarray(lights["lamp"].radiance, float).reshape(-1, 3)
+    to = np.asarray(cubemap.direction(size=8), float).reshape(-1, 3)
+    area = np.asarray(cubemap.solid_angle(size=8), float).reshape(-1)
+    weight = area * np.exp((ways @ to.T - 1) / 0.2**2)
+    expected = (weight @ radiance) / weight.sum(1, keepdims=True)
+    expected = np.asarray(image.display(expected, stops=hand.state()["stops"]))
+    np.testing.assert_allclose(shown[:60:20, :60:20].reshape(-1, 3), expected, atol=0.03)
+    picture = saved(hand, width, height, transparent=False)
+    off = np.abs(picture[..., :3] - shown)
+    assert off.mean() < 1.5 / 255
+
+
+def test_a_video_shows_the_camera_go_around(hand):
+    hand.page.get_by_role("button", name="save a picture").click()
+    hand.page.get_by_label("what").select_option("orbit")
+    for name, value in (("width in pixels", 64), ("height in pixels", 48), ("seconds", 1)):
+        hand.page.get_by_label(name).fill(str(value))
+    with hand.page.expect_download(timeout=120_000) as download:
+        hand.page.get_by_role("button", name="save", exact=True).click()
+    data = base64.b64encode(download.value.path().read_bytes()).decode()
+    kind = download.value.suggested_filename.removeprefix("jaxprt.")
+    found = hand.page.evaluate(
+        """async ([data, kind]) => {
+            const video = document.createElement("video"), canvas = document.createElement("canvas");
+            video.src = `data:video/${kind};base64,${data}`;
+            const seek = (time) => new Promise((resolve, reject) => {
+                [video.onseeked, video.onerror] = [resolve, () => reject(new Error(video.error.message))];
+                video.currentTime = time;
+                setTimeout(() => reject(new Error(`no picture at ${time}`)), 20000);
+            });
+            const frames = [];
+            for (const time of [1e6, 0.1, 0.5, 0.93]) {
+                await seek(time);
+                Object.assign(canvas, { width: video.videoWidth, height: video.videoHeight });
+                const context = canvas.getContext("2d");
+                context.drawImage(video, 0, 0);
+                frames.push(Array.from(context.getImageData(0, 0, canvas.width, canvas.height).data));
+            }
+            return { width: canvas.width, height: canvas.height, duration: video.duration, frames };
+        }""",
+        [data, kind],
+    )
+    assert (found["width"], found["height"]) == (64, 48)
+    assert found["duration"] == pytest.approx(1, abs=0.4)
+    _, first, half, last = (np.reshape(frame, (48, 64, 4)) / 255 for frame in found["frames"])
+    assert np.abs(first - half)[..., :3].mean() > 0.02  # from the other side
+    assert np.abs(first - last)[..., :3].mean() < 0.7 * np.abs(first - half)[..., :3].mean()
+
+
+def test_the_materials_are_saved_as_they_are_now(hand):
+    typed(hand, "metallic", "1")
+    hand.page.get_by_role("button", name="save a picture").click()
+    hand.page.get_by_label("what").select_option("materials")
+    with hand.page.expect_download() as download:
+        hand.page.get_by_role("button", name="save", exact=True).click()
+    told = json.loads(download.value.path().read_text())["materials"]
+    assert told["ball"]["metallic"] == 1
+    assert told["ball"]["roughness"] == pytest.approx(0.5)
+    assert set(told["ground"]) == {"diffuse"}
+
+
 def test_it_starts_at_the_automatic_exposure_of_the_object_in_each_light(hand, systems, lights):
     scene, view_of = systems["lobes"], hand.camera()
     height, width = 96, round(96 * hand.pixels().shape[1] / hand.pixels().shape[0])
@@ -303,7 +385,7 @@ def saved(hand, width, height, *, transparent):
     hand.page.get_by_label("height in pixels").fill(str(height))
     hand.page.get_by_label("transparent background").set_checked(transparent)
     with hand.page.expect_download(timeout=60_000) as download:
-        hand.page.get_by_role("button", name="save PNG").click()
+        hand.page.get_by_role("button", name="save", exact=True).click()
     assert download.value.suggested_filename == "jaxprt.png"
     picture = np.asarray(Image.open(download.value.path())) / 255
     hand.page.get_by_label("width in pixels").wait_for(state="hidden")
@@ -322,7 +404,7 @@ def test_a_picture_of_any_size_is_saved_with_alpha(hand, systems, lights, sessio
     hand.page.get_by_role("button", name="save a picture").click()
     for name in ("width", "height"):
         hand.page.get_by_label(f"{name} in pixels").fill("8000")
-    hand.page.get_by_role("button", name="save PNG").click()
+    hand.page.get_by_role("button", name="save", exact=True).click()
     hand.page.get_by_text("a picture must have at most 16777216 pixels, got 8000 x 8000").wait_for()
     hand.page.get_by_label("width in pixels").fill("50")
     hand.page.get_by_label("height in pixels").fill("30")
@@ -336,7 +418,7 @@ def test_a_picture_of_any_size_is_saved_with_alpha(hand, systems, lights, sessio
     hand.page.get_by_label("transparent background").set_checked(False)
     bar = hand.page.get_by_role("progressbar", name="a picture of 50 x 30 pixels")
     with hand.page.expect_download():
-        hand.page.get_by_role("button", name="save PNG").click()
+        hand.page.get_by_role("button", name="save", exact=True).click()
         bar.wait_for()
         assert hand.page.locator(".stagetext").text_content() == "a picture of 50 x 30 pixels"
     bar.wait_for(state="hidden")
@@ -360,7 +442,7 @@ def test_the_dialog_opens_with_what_was_saved_last_and_without_what_was_canceled
     assert shown() == first
     for field in fields[:2]:
         field.fill("8000")
-    page.get_by_role("button", name="save PNG").click()
+    page.get_by_role("button", name="save", exact=True).click()
     page.get_by_text("a picture must have at most 16777216 pixels, got 8000 x 8000").wait_for()
     cancel.click()
     assert shown() == first

@@ -68,6 +68,33 @@ def test_a_scene_is_told_with_what_can_change(session, systems):
     assert reply.content["systems"] == {"lobes": {"bounces": True}, "harmonics": {"bounces": False}}
 
 
+def test_a_picture_and_the_scene_are_files_of_other_programs(session, systems, lights, look, tmp_path):
+    material = {"ball": {"roughness": 0.7, "diffuse": [0.1, 0.2, 0.3]}}
+    asked = look | {
+        "kind": "picture",
+        "width": 24,
+        "height": 16,
+        "transparent": True,
+        "samples": 4,
+        "materials": material,
+    }
+    path = tmp_path / "picture.exr"
+    path.write_bytes(session.answer(asked | {"format": "exr"}).buffers[0])
+    pixel, _ = files.read_image(path)
+    scene, camera = systems["lobes"].without_bounces(), Camera([2, 1.5, 4], [0, 0, 0], [0, 1, 0], 0.7, 24, 16)
+    changed = {"ball": stages.change_material(scene.scene["ball"].material, "ball", material["ball"])}
+    expected = scene.picture(lights["lamp"], camera, materials=changed, background=None)
+    np.testing.assert_allclose(pixel, expected, atol=2e-3 * float(jnp.max(expected)))
+    assert session.answer(asked | {"format": "gif"}).content["message"] == "the format must be png or exr, got 'gif'"
+    path = tmp_path / "scene.glb"
+    path.write_bytes(session.answer(asked | {"kind": "glb"}).buffers[0])
+    again = prt.load_scene(path)
+    assert again.names == scene.scene.names
+    np.testing.assert_allclose(again["ball"].material.base_color, [0.1, 0.2, 0.3], rtol=1e-6)
+    np.testing.assert_allclose(again["ball"].material.roughness, 0.7, rtol=1e-6)
+    np.testing.assert_allclose(again["ground"].mesh.position, scene.scene["ground"].mesh.position, atol=1e-6)
+
+
 @pytest.mark.parametrize(("system", "bounces"), [("lobes", True), ("harmonics", False)])
 def test_a_look_is_the_radiance_of_its_state(session, systems, lights, look, system, bounces):
     look |= {"system": system, "bounces": bounces, "turn": 0.7, "eye": [1.0, 2.0, 3.0]}

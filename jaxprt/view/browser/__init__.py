@@ -18,6 +18,7 @@ _FILES = (
     "panel",
     "gestures",
     "style",
+    "saving",
     "frame",
     "piece",
     "waiting",

@@ -25,6 +25,12 @@ export class Camera {
     this.azimuth -= dx;
     this.elevation = clamp(this.elevation + dy, -1.55, 1.55);
   }
+  // The same camera, gone around the target by an angle.
+  around(angle) {
+    const result = Object.assign(Object.create(Camera.prototype), this);
+    result.azimuth += angle;
+    return result;
+  }
   pan(dx, dy) { // of the height of the picture
     const [x, y] = this.axes, step = 2 * this.distance * Math.tan(this.angle / 2);
     this.target = add(add(this.target, x, -dx * step), y, dy * step);

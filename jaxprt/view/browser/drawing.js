@@ -1,6 +1,6 @@
 // Draws the sky, the mesh with colors at its vertices, and pictures at rest.
 
-import { clamp } from "./common.js";
+import { clamp, half } from "./common.js";
 import { toHalf } from "./lights.js";
 import { WIDTH } from "./shading.js";
 import { drawSides } from "./pixels.js";
@@ -59,6 +59,9 @@ const STILL = `#version 300 es
 precision highp float; in vec2 at; out vec4 o; uniform sampler2D image; uniform float alpha; ${DISPLAY}
 void main(){ vec4 c = textureLod(image, vec2(at.x, 1. - at.y), 0.); o = vec4(display(c.rgb), alpha * c.a); }`;
 
+export const BACKGROUNDS = ["light", "blurred light", "color", "none"]; // what is seen behind the scene
+const BLURRED = 32; // rows of the blurred light
+const WIDE = 0.2; // radians: the deviation by which it is blurred
 export const TONES = ["srgb", "filmic", "agx", "aces", "neutral"];
 
 const MOST_PIXELS = 2 ** 24; // of a picture that is saved
@@ -97,7 +100,7 @@ export class Drawing {
     this.empty = gl.createVertexArray();
     this.array = gl.createVertexArray();
     [this.position, this.color, this.index] = [0, 1, 2].map(() => gl.createBuffer());
-    this.skyImage = null;
+    this.skyImage = this.blurredImage = null;
     this.gpu?.build();
     this.stills = []; // pictures at rest: the last one appears over the one before
   }
@@ -149,7 +152,20 @@ export class Drawing {
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, levels - 1);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
     [this.skyScale, this.skyHeight] = [scale, height];
+    // The last and smallest of the pictures is what is blurred.
+    const [w, h] = [width >> (levels - 1), height >> (levels - 1)];
+    if (this.blurredImage) gl.deleteTexture(this.blurredImage);
+    [this.blurredImage, this.coarseSky] = [null, { data: data.subarray(data.length - 3 * w * h), width: w, height: h }];
   }
+  // The light as it is seen, its brightness, and the level of detail of its image; null where it is not the background.
+  behind(camera, state, height) {
+    if (state.background === "light" && this.skyImage) return { image: this.skyImage, lod: Math.log2((2 * Math.tan(camera.angle / 2) * this.skyHeight) / (height * Math.PI)) };
+    if (state.background !== "blurred light" || !this.skyImage) return null;
+    this.blurredImage ??= this.texture(blurred(this.coarseSky), 2 * BLURRED, BLURRED, false, true);
+    return { image: this.blurredImage, lod: 0 };
+  }
+  // What the mesh is drawn on, in colors of the display.
+  ground(state) { return [...(state.background === "color" ? state.ground : [0.1, 0.1, 0.1]), 1]; }
   addStill(data, width, height, encoded, scale, cover = null) { // cover: bytes of alpha, where no background is seen
     this.dropStills(1);
     let all = data;
@@ -175,29 +191,29 @@ export class Drawing {
   }
   // The sky and the mesh, on a ground of one color, in the framebuffer of the moment: an image of shaded pixels, or
   // colors at vertices without one.
-  paint(camera, state, center, { width, height }, ground, image = null) {
+  paint(camera, state, center, { width, height }, ground, image = null, surfaces = true) {
     const gl = this.gl, gpu = this.gpu, gain = 2 ** state.stops, tone = TONES.indexOf(state.tone);
     gl.viewport(0, 0, width, height);
     gl.clearColor(...ground);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    const sky = state.background && this.skyImage, through = sky && image && gpu.piece.blends; // light adds up before it is displayed
+    const sky = this.behind(camera, state, height), through = sky && image && gpu.piece.blends && surfaces; // light adds up before it is displayed
     if (sky) {
       const program = through ? this.through : this.sky;
       if (through) this.quad(program, image.handle, gain, false, tone);
-      else this.quad(program, this.skyImage, gain * this.skyScale, false, tone);
+      else this.quad(program, sky.image, gain * this.skyScale, false, tone);
       gl.uniformMatrix3fv(program.at("ray"), false, camera.ray(width / height));
       gl.uniform1f(program.at("turn"), state.turn);
-      gl.uniform1f(program.at("lod"), Math.log2((2 * Math.tan(camera.angle / 2) * this.skyHeight) / (height * Math.PI)));
+      gl.uniform1f(program.at("lod"), sky.lod);
       if (through) {
         gl.activeTexture(gl.TEXTURE0 + gpu.stencilUnit);
-        gl.bindTexture(gl.TEXTURE_2D, this.skyImage);
+        gl.bindTexture(gl.TEXTURE_2D, sky.image);
         gl.uniform1i(program.at("behind"), gpu.stencilUnit);
         gl.uniform1f(program.at("bright"), this.skyScale);
       }
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
     gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    if (through) return;
+    if (through || !surfaces) return;
     if (image) {
       gl.enable(gl.BLEND);
       this.quad(this.shaded, image.handle, gain, false, tone);
@@ -231,18 +247,26 @@ export class Drawing {
       this.exposed(this.exposure(camera, state, center));
     }
     const gain = 2 ** state.stops, tone = TONES.indexOf(state.tone);
-    this.paint(camera, state, center, this.canvas, [0.1, 0.1, 0.1, 1], gpu?.shown);
+    this.paint(camera, state, center, this.canvas, this.ground(state), gpu?.shown);
     let alpha = 1;
     gl.enable(gl.BLEND);
     for (const each of this.stills) {
       alpha = clamp((now - each.since) / FADE, 0, 1);
-      if (each.clear && alpha === 1) gl.clear(gl.COLOR_BUFFER_BIT); // edges of what was drawn before lie beside its own
+      if (each.clear && alpha === 1) { // edges of what was drawn before lie beside its own
+        gl.disable(gl.BLEND);
+        this.paint(camera, state, center, this.canvas, this.ground(state), null, false);
+        gl.enable(gl.BLEND);
+      }
       this.quad(this.still, each.image, gain * each.scale, each.encoded, tone);
       gl.uniform1f(this.still.at("alpha"), alpha);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
     gl.disable(gl.BLEND);
     return more || alpha < 1;
+  }
+  // What is behind the scene, as `picture` has it.
+  backdrop(camera, state, center, width, height) {
+    return { pixel: this.pixels(camera, state, center, { width, height }, null, 4, false), parts: 1 };
   }
   // A picture of any size as rows of RGBA from below, colors times alpha, and how many of its pixels make one along an edge.
   async picture(camera, state, center, width, height) {
@@ -256,7 +280,7 @@ export class Drawing {
   }
   // Bytes, RGBA from the lower left, of what is painted at a size of its own: an image of shaded pixels, or colors at
   // vertices without one. Alpha is 0 where there is only the ground.
-  pixels(camera, state, center, { width, height }, image = null, mostSamples = 4) {
+  pixels(camera, state, center, { width, height }, image = null, mostSamples = 4, surfaces = true) {
     const gl = this.gl, most = gl.getParameter(gl.MAX_RENDERBUFFER_SIZE), samples = Math.min(mostSamples, gl.getParameter(gl.MAX_SAMPLES));
     if (Math.max(width, height) > most) throw new Error(`a picture must have at most ${most} pixels along an edge in this browser, got ${width} x ${height}`);
     const buffer = (count, kind, place) => {
@@ -270,7 +294,7 @@ export class Drawing {
     if (this.gpu && !image) this.gpu.piece.vertices(this.gpu.message);
     gl.bindFramebuffer(gl.FRAMEBUFFER, many);
     const buffers = [buffer(samples, gl.RGBA8, gl.COLOR_ATTACHMENT0), buffer(samples, gl.DEPTH_COMPONENT24, gl.DEPTH_ATTACHMENT)];
-    this.paint(camera, state, center, { width, height }, [0, 0, 0, 0], image);
+    this.paint(camera, state, center, { width, height }, state.background === "color" ? this.ground(state) : [0, 0, 0, 0], image, surfaces);
     gl.bindFramebuffer(gl.FRAMEBUFFER, one);
     buffers.push(buffer(0, gl.RGBA8, gl.COLOR_ATTACHMENT0));
     gl.bindFramebuffer(gl.READ_FRAMEBUFFER, many);
@@ -286,10 +310,30 @@ export class Drawing {
   // the 99th percentile of luminance over pixels that surfaces fill is 0.9. Null where no surface is seen, or all is black.
   exposure(camera, state, center) {
     const height = 96, width = Math.max(1, Math.round((height * this.canvas.width) / this.canvas.height));
-    const pixel = this.pixels(camera, { ...state, stops: 0, tone: "", background: false }, center, { width, height }, this.gpu?.shown, 0), lit = [];
+    const pixel = this.pixels(camera, { ...state, stops: 0, tone: "", background: "none" }, center, { width, height }, this.gpu?.shown, 0), lit = [];
     for (let i = 0; i < pixel.length; i += 4) if (pixel[i + 3] === 255 && pixel[i] + pixel[i + 1]) lit.push(pixel[i] + pixel[i + 1] / 255);
     const bright = lit.sort((x, y) => x - y)[Math.round(0.99 * (lit.length - 1))];
     return bright === undefined ? null : Math.log2(0.9) - ((bright - 127.5) * 2 * MOST_STOPS) / 255;
   }
   close() { this.gl.getExtension("WEBGL_lose_context")?.loseContext(); }
+}
+
+// A latitude-longitude picture of half floats, blurred over the sphere.
+function blurred({ data, width, height }) {
+  const rows = BLURRED, columns = 2 * rows, small = new Float32Array(3 * rows * columns), result = new Uint16Array(small.length), step = height / rows;
+  for (let y = 0; y < height; y++) for (let x = 0; x < width; x++) for (let c = 0; c < 3; c++) small[3 * (Math.floor(y / step) * columns + Math.floor(x / step)) + c] += half(data[3 * (y * width + x) + c]) / step ** 2;
+  const latitude = (row) => Math.PI * (0.5 - (row + 0.5) / rows), concentration = 1 / WIDE ** 2;
+  for (let y = 0; y < rows; y++) for (let x = 0; x < columns; x++) {
+    const sum = [0, 0, 0], up = latitude(y);
+    let total = 0;
+    for (let v = 0; v < rows; v++) for (let u = 0; u < columns; u++) {
+      const at = latitude(v), cosine = Math.sin(up) * Math.sin(at) + Math.cos(up) * Math.cos(at) * Math.cos((2 * Math.PI * (u - x)) / columns);
+      const weight = Math.cos(at) * Math.exp(concentration * (cosine - 1));
+      if (weight < 1e-3) continue;
+      total += weight;
+      for (let c = 0; c < 3; c++) sum[c] += weight * small[3 * (v * columns + u) + c];
+    }
+    for (let c = 0; c < 3; c++) result[3 * (y * columns + x) + c] = toHalf(sum[c] / total);
+  }
+  return result;
 }

@@ -2,6 +2,7 @@
 
 import { clamp, element } from "./common.js";
 import { HINT, HELP } from "./gestures.js";
+import { dialogOf } from "./saving.js";
 import { STYLE } from "./style.js";
 
 const NARROW = 480; // pixels of the frame up to which the panel lies below the picture, and is folded at first
@@ -17,7 +18,7 @@ const ICONS = {
   panel: "M2 4.5h6m3 0h3M9.5 3v3M2 11.5h2m3 0h7M5.5 10v3",
 };
 
-// The elements of a viewer in `shadow`. `on` has what its buttons do: `reset`, and `picture` with the size that is chosen.
+// The elements of a viewer in `shadow`. `on` has what its buttons do: `reset`, `undo`, and `save` with what is chosen.
 export function frameOf(shadow, on) {
   element("style", shadow, { textContent: STYLE });
   const frame = element("div", shadow, { className: "frame" }), stage = element("div", frame, { className: "stage" });
@@ -37,7 +38,7 @@ export function frameOf(shadow, on) {
   panel.setAttribute("role", "region");
   panel.setAttribute("aria-label", "controls");
   const help = helpOf(stage);
-  const dialog = dialogOf(frame, canvas, on.picture);
+  const dialog = dialogOf(frame, canvas, on.save);
   const tool = (name, label, act) => {
     const node = element("button", tools, { type: "button", title: label, onclick: act });
     node.innerHTML = `<svg viewBox="0 0 16 16" aria-hidden="true"><path d="${ICONS[name]}"/></svg>`;
@@ -47,7 +48,7 @@ export function frameOf(shadow, on) {
   const started = () => { hint.hidden = true; };
   const toggleHelp = () => { help.hidden = !help.hidden; started(); if (help.hidden) canvas.focus(); else help.querySelector("button").focus(); };
   help.querySelector("button").onclick = toggleHelp;
-  tool("picture", "save a picture", () => dialog.open());
+  tool("picture", "save a picture, a video or the state", () => dialog.open());
   const [undo, redo] = [tool("undo", "undo (Z)", () => on.undo(-1)), tool("redo", "redo (Y)", () => on.undo(1))];
   tool("reset", "reset the view, the light and the materials (R)", on.reset);
   tool("theme", "dark or light", () => theme(!frame.classList.contains("light")));
@@ -107,53 +108,4 @@ function helpOf(parent) {
     element("td", row, { textContent: what });
   }
   return help;
-}
-
-// Asks for the size of a picture, and whether its background is transparent.
-function dialogOf(parent, canvas, make) {
-  const dialog = element("dialog", parent), form = element("form", dialog, { method: "dialog" });
-  dialog.setAttribute("aria-label", "save a picture");
-  element("h2", form, { textContent: "Save a picture" });
-  const field = (text, fields) => {
-    const row = element("label", form, { className: "row" });
-    element("span", row, { textContent: text });
-    return element("input", row, fields);
-  };
-  const number = { type: "number", min: 1, max: 8192, step: 1, required: true };
-  const width = field("width in pixels", number), height = field("height in pixels", number);
-  const clear = field("transparent background", { type: "checkbox" });
-  const note = element("div", form, { className: "note" });
-  note.setAttribute("role", "status");
-  const end = element("div", form, { className: "row end" });
-  const cancel = element("button", end, { type: "button", textContent: "cancel", onclick: () => dialog.close() });
-  const save = element("button", end, { type: "submit", className: "main", textContent: "save PNG" });
-  const lock = (locked) => { for (const each of [width, height, clear, save, cancel]) each.disabled = locked; };
-  let saved = null; // the choices of the last picture that was saved
-  form.onsubmit = async (event) => {
-    event.preventDefault();
-    lock(true);
-    note.textContent = "the picture is being made";
-    const choice = { width: Number(width.value), height: Number(height.value), transparent: clear.checked };
-    try {
-      const blob = await make(choice);
-      const link = element("a", form, { href: URL.createObjectURL(blob), download: "jaxprt.png" });
-      link.click();
-      link.remove();
-      setTimeout(() => URL.revokeObjectURL(link.href), 60000);
-      saved = choice;
-      dialog.close();
-    } catch (error) { note.textContent = error.message; }
-    lock(false);
-  };
-  return {
-    open() {
-      if (!save.disabled) { // else the dialog was left while its picture is being made
-        note.textContent = "";
-        const { transparent, ...size } = saved ?? { width: canvas.width, height: canvas.height, transparent: false };
-        [width.value, height.value, clear.checked] = [size.width, size.height, transparent];
-      }
-      dialog.showModal();
-      width.select();
-    },
-  };
 }

@@ -1,6 +1,7 @@
 // What the mouse, fingers and keys do.
 
 import { clamp } from "./common.js";
+import { BACKGROUNDS } from "./drawing.js";
 
 const GLIDE = 130; // milliseconds in which a turn that was let go falls to a third of its speed
 const STOPPED = 60; // milliseconds without a move after which the hand had stopped
@@ -145,7 +146,7 @@ function key(event, on) {
       // What changes nothing leaves the picture at rest.
       l: () => scene.lights.length > 1 && on.set({ light: (state.light + 1) % scene.lights.length }),
       s: () => names.length > 1 && on.set({ system: next, bounces: state.bounces && scene.systems[next].bounces }),
-      b: () => scene.systems[state.system].bounces && on.set({ bounces: !state.bounces }), g: () => on.set({ background: !state.background }),
+      b: () => scene.systems[state.system].bounces && on.set({ bounces: !state.bounces }), g: () => on.set({ background: BACKGROUNDS[(BACKGROUNDS.indexOf(state.background) + 1) % BACKGROUNDS.length] }),
       p: () => on.set({ still: !state.still }), e: () => on.set({ exact: !state.exact }), z: () => on.undo(event.shiftKey ? 1 : -1), y: () => on.undo(1), f: () => on.frame(), c: () => state.lamps.length && on.set({ lamps: [] }), r: () => on.reset(),
       a: () => on.automatic(true), h: () => on.toggleHelp(), escape: () => on.help.hidden || on.toggleHelp(),
     }[event.key.toLowerCase()];

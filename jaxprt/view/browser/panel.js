@@ -1,7 +1,7 @@
 // The panel of controls: the light, the view, and the materials of the parts.
 
 import { clamp, dot, element, half, hex, toDisplay, unhex } from "./common.js";
-import { TONES } from "./drawing.js";
+import { BACKGROUNDS, TONES } from "./drawing.js";
 
 const MANY = 3; // parts up to which all of their controls are open at first; of more, the first
 const FILTER = 10; // parts up to which one is open at first; of more, names can be searched
@@ -44,6 +44,7 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
   panel.textContent = "";
   const choice = (parent, text, names, pick) => {
     const node = element("select", row(parent, text));
+    node.setAttribute("aria-label", text);
     node.fill = (labels) => { node.textContent = ""; labels.forEach((name, i) => element("option", node, { textContent: name, value: i })); };
     node.fill(names);
     node.onchange = () => pick(Number(node.value));
@@ -82,7 +83,10 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
   auto[1].onchange = () => automatic(auto[1].checked);
   const tone = choice(viewPart, "tone curve", TONES, (i) => map(TONES[i]));
   const wide = slider(viewPart, "view angle °", { low: 5, high: 120, step: 1, digits: 1 }, (degrees) => widen(degrees * DEGREE));
-  const boxes = [auto, box(viewPart, "background", "background")];
+  const behind = choice(viewPart, "background", BACKGROUNDS, (i) => set({ background: BACKGROUNDS[i] }));
+  const ground = element("input", row(viewPart, "its color"), { type: "color" });
+  ground.oninput = () => set({ ground: [1, 3, 5].map((i) => parseInt(ground.value.slice(i, i + 2), 16) / 255) });
+  const boxes = [auto];
   if (scene.rests.includes("still")) boxes.push(box(viewPart, "fine picture at rest", "still"));
   if (scene.rests.includes("exact")) boxes.push(box(viewPart, "exact picture at rest", "exact"));
   if (Object.values(scene.systems).some((each) => each.bounces)) boxes.push(box(viewPart, "bounces", "bounces"));
@@ -106,6 +110,9 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
       exposure.show(state.stops);
       wide.show(camera().angle / DEGREE);
       tone.value = TONES.indexOf(state.tone);
+      behind.value = BACKGROUNDS.indexOf(state.background);
+      ground.value = "#" + state.ground.map((x) => Math.round(255 * x).toString(16).padStart(2, "0")).join("");
+      ground.parentElement.hidden = state.background !== "color";
       clear.disabled = !state.lamps.length;
       for (const [key, each] of boxes) each.checked = state[key];
       for (const part of parts.values()) part.show();

@@ -2,7 +2,7 @@
 
 const KEPT = 200; // states that can be taken back
 const SETTLED = 300; // milliseconds without a change after which a state is one of them
-const FIELDS = ["system", "turn", "lamps", "auto", "tone", "background", "bounces", "still", "exact", "materials"];
+const FIELDS = ["system", "turn", "lamps", "auto", "tone", "background", "ground", "bounces", "still", "exact", "materials"];
 const DIGITS = 10;
 
 // A state as text: JSON. Places are those of the file, whose origin the scene has, and the light has its name.

@@ -57,10 +57,10 @@ kbd { font: inherit; font-weight: 600; padding: 0 4px; border: 1px solid var(--e
 .sky, .plane { display: block; margin: 4px 0; touch-action: none; cursor: crosshair; border-radius: 4px; }
 .sky { width: 100%; aspect-ratio: 2; }
 .plane { width: 132px; height: 132px; }
-dialog { color: var(--text); background: var(--card); border: 1px solid var(--edge); border-radius: 8px; padding: 12px 16px 16px; width: 280px; max-width: calc(100vw - 32px); }
+dialog { color: var(--text); background: var(--card); border: 1px solid var(--edge); border-radius: 8px; padding: 12px 16px 16px; width: 320px; max-width: calc(100vw - 32px); }
 dialog::backdrop { background: #0008; }
 dialog h2 { font-size: 14px; margin: 0 0 8px; }
-dialog .row > span:first-child { flex-basis: 150px; }
+dialog .row > span:first-child { flex-basis: 130px; }
 dialog .row.end { justify-content: flex-end; margin-top: 12px; }
 dialog .row.end button { flex: 0 0 auto; padding: 2px 12px; }
 .frame.folded .panel { display: none; }

@@ -10,6 +10,7 @@ import { Pixels } from "./pixels.js";
 import { panelOf } from "./panel.js";
 import { gestures } from "./gestures.js";
 import { frameOf } from "./frame.js";
+import { materials, video } from "./saving.js";
 import { Waiting, follow } from "./waiting.js";
 
 const SKY_ROWS = 1024; // of the picture of a light at rest, if its file has so many
@@ -22,9 +23,9 @@ export function mount(root, ask, { addressed = false } = {}) {
   const shadow = root.shadowRoot ?? root.attachShadow({ mode: "open" });
   shadow.textContent = "";
   root.dataset.lmSuppressShortcuts = "true"; // JupyterLab leaves the keys to the viewer
-  const view = frameOf(shadow, { reset: () => scene && reset(), undo: (by) => scene && past.step(by), picture: (size) => picture(size) });
+  const view = frameOf(shadow, { reset: () => scene && reset(), undo: (by) => scene && past.step(by), save: { make: (...choice) => save(...choice), python: () => scene?.rests.includes("picture") } });
   const { frame, canvas, panel, line, help, tell, busy } = view;
-  const state = { system: "", light: 0, turn: 0, lamps: [], stops: 0, auto: true, tone: "srgb", background: true, bounces: false, still: true, exact: false, materials: {} };
+  const state = { system: "", light: 0, turn: 0, lamps: [], stops: 0, auto: true, tone: "srgb", background: "light", ground: [0.8, 0.8, 0.8], bounces: false, still: true, exact: false, materials: {} };
   const stats = (canvas.stats = { sent: 0, got: 0, errors: 0, stills: 0, coarse: 0, draws: 0, sky: 0, bytes: 0, seq: 0, shown: -1, trip: 0 });
   let scene = null, camera = null, drawing = null, closed = false;
   // Whether round trips are long: the kernel is far away, or the browser draws slowly. Then colors come as bytes, and
@@ -205,7 +206,7 @@ export function mount(root, ask, { addressed = false } = {}) {
     if (state.exact) steps.push(["exact", true], ["exact", false]);
     try {
       for (const [kind, coarse] of steps) {
-        const asked = { ...message(kind), ...size, coarse, transparent: !state.background }, words = "computing the picture at pixels";
+        const asked = { ...message(kind), ...size, coarse, transparent: state.background !== "light" }, words = "computing the picture at pixels";
         const { content, buffers } = await waiting.during("still", kind === "still" ? words : "computing the exact picture", ask(asked));
         if (closed) break;
         if (unanswered) { unanswered = false; tell(""); }
@@ -333,17 +334,44 @@ export function mount(root, ask, { addressed = false } = {}) {
     camera.target = found.point;
     moved();
   };
-  // A picture of any size as a file: by Python where there is one, else by the graphics card.
-  const picture = async ({ width, height, transparent }) => {
+  // A picture of any size as a file: by Python where there is one, else by the graphics card. `from` has a camera, and
+  // fields of the message and the state that are others for it.
+  const picture = async ({ width, height, transparent, format = "png", samples }, from = { camera, fields: {} }) => {
     if (!scene) throw new Error("there is no scene yet");
-    const python = scene.rests.includes("picture"), asked = python && { ...message("picture"), stops: state.stops, width, height, transparent };
-    const sent = python ? ask(asked) : drawn(drawing, camera, { ...state, background: !transparent }, scene.center, width, height);
-    const answer = await waiting.during("picture", `a picture of ${width} x ${height} pixels`, sent, 0);
-    redraw();
-    if (!python) return answer;
+    const shows = { ...state, ...from.fields, background: transparent ? "none" : state.background }, python = scene.rests.includes("picture");
+    if (!python) drawing.gpu?.change({ ...message("look"), ...from.fields, eye: from.camera.eye });
+    if (!python) return drawn(await drawing.picture(from.camera, shows, scene.center, width, height), width, height);
+    const over = !transparent && format === "png" && state.background !== "light";
+    const asked = { ...message("picture"), ...from.fields, eye: from.camera.eye, stops: state.stops, width, height, transparent: transparent || over, format, samples };
+    const answer = await waiting.during("picture", `a picture of ${width} x ${height} pixels`, ask(asked), 0);
     if (answer.content.kind === "late") throw new Error("a better scene has come meanwhile: ask again");
     if (answer.content.kind === "error") throw new Error(answer.content.message);
-    return new Blob([answer.buffers[0]], { type: "image/png" });
+    const blob = new Blob([answer.buffers[0]], { type: `image/${format}` });
+    return over ? drawn(drawing.backdrop(from.camera, shows, scene.center, width, height), width, height, await createImageBitmap(blob)) : blob;
+  };
+  const save = async (choice, told, signal) => {
+    const { kind } = choice, json = (text) => new Blob([text], { type: "application/json" });
+    if (!scene) throw new Error("there is no scene yet");
+    if (kind === "state") return { blob: json(past.take()), name: "jaxprt.json" };
+    if (kind === "materials") return { blob: json(materials(scene, state.materials)), name: "materials.json" };
+    if (kind === "glb") {
+      const { content, buffers } = await ask(message("glb"));
+      if (content.kind === "error") throw new Error(content.message);
+      return { blob: new Blob([buffers[0]], { type: "model/gltf-binary" }), name: "jaxprt.glb" };
+    }
+    const quick = { ...choice, samples: 4, transparent: false };
+    const frames = {
+      orbit: (share) => picture(quick, { camera: camera.around(2 * Math.PI * share), fields: {} }),
+      turn: (share) => picture(quick, { camera, fields: { turn: state.turn + 2 * Math.PI * share } }),
+    };
+    try {
+      if (!frames[kind]) return { blob: await picture({ ...choice, format: kind }), name: `jaxprt.${kind}` };
+      const blob = await video(frames[kind], choice, told, signal);
+      return { blob, name: `jaxprt.${blob.type.split("/")[1]}` };
+    } finally {
+      drawing.gpu?.change(message("look"));
+      redraw();
+    }
   };
   let controls = null;
   // What Python prepares: the page shows how far it is, and takes each better scene.
@@ -435,10 +463,9 @@ export function mount(root, ask, { addressed = false } = {}) {
   return () => { closed = true; unfollow(); past.close(); if (addressed) window.removeEventListener("hashchange", arrived); watch.disconnect(); view.close(); hands.close(); clearTimeout(stillTimer); drawing.close(); };
 }
 
-// A picture that the graphics card draws, as a PNG file.
-async function drawn(drawing, camera, state, center, width, height) {
-  const { pixel, parts } = await drawing.picture(camera, state, center, width, height), row = 4 * parts * width;
-  const canvas = Object.assign(document.createElement("canvas"), { width, height }), context = canvas.getContext("2d"), image = context.createImageData(width, height);
+// Pixels that the graphics card has drawn as a PNG file, with an image over them.
+async function drawn({ pixel, parts }, width, height, over = null) {
+  const row = 4 * parts * width, canvas = Object.assign(document.createElement("canvas"), { width, height }), context = canvas.getContext("2d"), image = context.createImageData(width, height);
   for (let y = 0, to = 0; y < height; y++) for (let x = 0; x < width; x++, to += 4) {
     const low = parts * ((height - 1 - y) * row + 4 * x), sum = [0, 0, 0, 0]; // rows come from below
     for (let i = 0; i < parts; i++) for (let j = 0; j < parts; j++) for (let c = 0; c < 4; c++) sum[c] += pixel[low + i * row + 4 * j + c];
@@ -446,6 +473,7 @@ async function drawn(drawing, camera, state, center, width, height) {
     image.data[to + 3] = sum[3] / parts ** 2;
   }
   context.putImageData(image, 0, 0);
+  if (over) context.drawImage(over, 0, 0);
   const file = await new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
   if (!file) throw new Error(`this browser cannot make a picture of ${width} x ${height} pixels`);
   return file;
