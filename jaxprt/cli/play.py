@@ -5,7 +5,8 @@ import sys
 import threading
 import time
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import SimpleNamespace
 
 import click
@@ -88,6 +89,13 @@ def command(chosen: SimpleNamespace) -> None:
     sys.stdout.flush()
     if not chosen.no_browser and chosen.address is None:  # a browser at another address is on another machine
         threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
+    own = {"output": None, "brdf": None, "material": ()}  # what belongs to the files of the command
+
+    def opener(paths: Sequence[Path]) -> None:
+        files = [path for path in paths if inputs.kind(path)]  # others belong to them
+        prepare(session, SimpleNamespace(**vars(chosen) | own | {"files": files}))
+
+    session.opener = opener
     session.prepare(lambda: prepare(session, chosen))
     ready = False
     try:
@@ -122,7 +130,9 @@ def prepare(session: Session, chosen: SimpleNamespace) -> None:
     report(f"reading {', '.join(path.name for path in chosen.files) or 'the embedded scene'}", None)
     # `precompute` divides the meshes, after a preview without division.
     scene = options.call(inputs.scene, chosen, refine=False, playable=True)
-    lights = options.call(inputs.lights, chosen)
+    # A scene that is opened later has the lights that are there.
+    lights = dict(zip(session.stages.name, session.stages.lights, strict=True)) if session.version else None
+    environments = lights or options.call(inputs.lights, chosen)
     refine = bool(inputs.split_files(chosen.files)[0]) and chosen.refine
     recipes = {
         {"lobe": f"{getattr(recipe, 'lobes', 0)} lobes", "harmonic": "harmonics"}.get(system, name): (system, recipe)
@@ -132,8 +142,9 @@ def prepare(session: Session, chosen: SimpleNamespace) -> None:
     session.progress.plan(_stages(len(recipes), refine=bool(refine), bounces=bool(chosen.bounces)))
     report("evaluating materials", None)
     first, (_, recipe) = next(iter(recipes.items()))
-    session.show_unshadowed(Unshadowed.of(scene, recipe), name=first, environments=lights)
-    wanted = {"bounces": chosen.bounces, "size": next(iter(lights.values())).radiance.shape[-2], "refine": refine}
+    session.show_unshadowed(Unshadowed.of(scene, recipe), name=first, environments=environments)
+    size = next(iter(environments.values())).radiance.shape[-2]
+    wanted = {"bounces": chosen.bounces, "size": size, "refine": refine}
     systems: dict[str, RelitScene] = {}
     for title, (system, recipe) in recipes.items():
         # A folder is shared by systems with any number of lobes.

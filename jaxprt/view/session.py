@@ -46,6 +46,8 @@ _MOST_PIXELS = 1 << 24  # of a picture that is saved
 _FINE_PIXELS = 1 << 22  # up to which such a picture has 16 samples a pixel in place of 4
 _SKY_ROWS = 2048.0  # most rows of the picture of a light
 _VIEWERS = 64  # most viewers whose newest look is remembered
+_WORKER = "jaxprt-prepare"  # name of threads that prepare
+_LONGEST = 1000  # characters of a file's name, with its folders
 _YIELD = 0.5  # most seconds for which each step of what is prepared waits for answers
 
 
@@ -73,6 +75,7 @@ class Session:
 
     Attributes:
         progress: What is being prepared.
+        opener: Function that computes the scene of files, with `report` and `show`; None if pages open no files.
     """
 
     def __init__(
@@ -91,7 +94,8 @@ class Session:
             TypeError: `show` says when.
             ValueError: `show` says when.
         """
-        self.progress = Progress()
+        self.progress, self.opener = Progress(), None
+        self._worker, self._scenes = None, 0  # the thread that prepares, and the number of scenes that were opened
         self._lock = threading.Lock()
         self._quiet, self._answering = threading.Condition(), 0
         self._newest: OrderedDict[str, int] = OrderedDict()  # sequence number of the newest look of each viewer
@@ -101,6 +105,9 @@ class Session:
         if systems is not None:
             self.show(systems, environments=environments)
             self.progress.finish()
+
+    opener: Callable[[Sequence[pathlib.Path]], None] | None
+    _worker: threading.Thread | None
 
     @property
     def stages(self) -> Stages:
@@ -160,7 +167,7 @@ class Session:
         self._replace(by_name, lights, preview=preview)
 
     def show_unshadowed(self, scene: Unshadowed, *, name: str, environments: Mapping[str, Environment]) -> None:
-        """Shows a scene before its rays are traced. A page can show it if its GPU shades pixels.
+        """Shows another scene before its rays are traced. A page can show it if its GPU shades pixels.
 
         Args:
             scene: The scene.
@@ -168,6 +175,7 @@ class Session:
             environments: Dictionary from names to lights.
         """
         _check_lights(environments)
+        self._scenes += 1
         self._replace({name: scene}, environments, preview=True)
 
     def _replace(
@@ -179,6 +187,8 @@ class Session:
     ) -> None:
         new = Stages(systems, environments or {})
         with self._lock:
+            if self._superseded:
+                raise EndedError
             old = self._version
             if environments is None and old is not None:
                 new.name, new.lights = old.stages.name, old.stages.lights
@@ -194,19 +204,27 @@ class Session:
             make: Function that calls `report` and `show`. An error that it raises is told to the page, and `wait`
                 raises it.
         """
-        threading.Thread(target=self._prepare, args=(make,), name="jaxprt-prepare", daemon=True).start()
+        progress = self.progress
+        self._worker = threading.Thread(target=self._prepare, args=(make, progress), name=_WORKER, daemon=True)
+        self._worker.start()
 
-    def _prepare(self, make: Callable[[], None]) -> None:
+    def _prepare(self, make: Callable[[], None], progress: Progress) -> None:
         try:
             make()
-            self.progress.prepared()
+            progress.prepared()
             for share in self.stages.rehearsal(*self._size) if self.version else ():
                 self.report(COMPILING, share)
         except EndedError:
             pass
         except BaseException as error:
-            self.progress.fail(error)
-        self.progress.finish()
+            progress.fail(error)
+        progress.finish()
+
+    @property
+    def _superseded(self) -> bool:
+        """Whether this thread prepares a scene in whose place another one has been opened."""
+        thread = threading.current_thread()
+        return thread.name == _WORKER and thread is not self._worker
 
     def report(self, stage: str, share: float | None) -> None:
         """Tells the page what is being done, and which share of it is done; None if nobody knows.
@@ -214,10 +232,11 @@ class Session:
         Raises:
             EndedError: The session has ended.
         """
-        self.progress.report(stage, share)
+        if not self._superseded:
+            self.progress.report(stage, share)
         with self._quiet:
             self._quiet.wait_for(lambda: self._ended or not self._answering, _YIELD)
-        if self._ended:
+        if self._ended or self._superseded:
             raise EndedError
 
     def end(self) -> None:
@@ -235,6 +254,7 @@ class Session:
             "glb": self._glb,
             "sky": self._sky,
             "drop": self._drop,
+            "open": self._open,
             "lights": self._lights,
             "page": self._page,
             "progress": self._progress,
@@ -303,6 +323,7 @@ class Session:
         content = {
             "kind": "scene",
             "version": number,
+            "scene": self._scenes,
             "finished": self.progress.finished,
             "parts": parts,
             "lights": shown.name,
@@ -470,6 +491,30 @@ class Session:
             first = len(self.stages.name) - 1
         return self._lights({"first": first}, [])
 
+    def _open(self, message: Message, buffers: Sequence[bytes]) -> Reply:
+        """Prepares the scene of files that were dropped on the viewer, in place of the one that is shown."""
+        names, opener = message.get("names"), self.opener
+        if opener is None:
+            raise ValueError("this viewer shows the scene of a program; `jaxprt view` opens files")
+        if not isinstance(names, list) or len(names) != len(buffers) or not names:
+            raise ValueError(f"names must be those of the {len(buffers)} files that came, at least one")
+        paths = [_inside(name) for name in names]
+
+        def make() -> None:
+            with tempfile.TemporaryDirectory() as folder:
+                places = [pathlib.Path(folder, *path.parts) for path in paths]
+                for place, data in zip(places, buffers, strict=True):
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    place.write_bytes(data)
+                try:
+                    opener(places)
+                except (ValueError, OSError) as error:
+                    raise ValueError(str(error).replace(f"{folder}{os.sep}", "")) from None
+
+        self.progress = Progress()
+        self.prepare(make)
+        return Reply({"kind": "open"}, [])
+
     def _lights(self, message: Message, buffers: Sequence[bytes]) -> Reply:
         """Names of all lights, and texels of those from a number on, `light`."""
         with self._lock:
@@ -489,6 +534,14 @@ class Session:
                 raise _LateError
 
         return between
+
+
+def _inside(name: object) -> pathlib.PurePosixPath:
+    """The place of a dropped file in a folder of its own."""
+    path = pathlib.PurePosixPath(str(name).replace("\\", "/").replace("\0", ""))
+    if not isinstance(name, str) or not path.name or path.is_absolute() or ".." in path.parts or len(name) > _LONGEST:
+        raise ValueError(f"names of files must be relative and without .., got {str(name)[:80]!r}")
+    return path
 
 
 def _alpha(picture: Float[np.ndarray, "h w 4"]) -> bytes:

@@ -1,17 +1,21 @@
 """A session that starts without a scene: what it tells meanwhile, and how better scenes replace each other."""
 
+import dataclasses
 import threading
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
 from jax._src import compiler
 
+import jaxprt as prt
 from jaxprt import files
 from jaxprt.view import Server, Session
 from jaxprt.view.messages import Reply
 from jaxprt.view.progress import EndedError, Progress
-from tests.view.hand import CANVAS
+from jaxprt.view.unshadowed import Unshadowed
+from tests.view.hand import CANVAS, Hand
 
 
 @pytest.fixture
@@ -258,4 +262,74 @@ def test_the_page_tells_what_is_done_and_keeps_its_state_when_a_better_scene_com
     empty.progress.finish()
     page.wait_for_function(f"() => {root}.querySelector('.stagetext').hidden", timeout=120_000)
     page.close()
+    server.close()
+
+
+def test_opened_files_are_prepared_in_place_of_the_scene(empty, systems, lights):
+    """With what belongs to them, in a folder of their own; the scene before stays until theirs comes."""
+    assert "`jaxprt view` opens files" in empty.answer({"kind": "open", "names": ["a.obj"]}, [b""]).content["message"]
+    empty.show({"lobes": systems["harmonics"]}, environments=lights)
+    begun, go, seen = threading.Event(), threading.Event(), []
+
+    def opener(paths):
+        seen.append({path.relative_to(path.parents[1]).as_posix(): path.read_bytes() for path in paths})
+        begun.set()
+        go.wait(60)
+        empty.report("reading", 0.5)  # which ends the first one: another has been opened
+        if b"broken" in seen[-1].values():
+            raise ValueError(f"{paths[0]} must be whole, got a part")
+        empty.show({"lobes": systems["harmonics"]})
+
+    empty.opener = opener
+    for names, words in (
+        (["../a.obj"], "names of files must be relative and without .., got '../a.obj'"),
+        (["/a.obj"], "got '/a.obj'"),
+        ([3], "got '3'"),
+        ([], "names must be those of the 1 files that came, at least one"),
+    ):
+        assert words in empty.answer({"kind": "open", "names": names}, [b"a"]).content["message"]
+    first = {"model/a.obj": b"first", "model/a.mtl": b"paint"}
+    assert empty.answer({"kind": "open", "names": list(first)}, list(first.values())).content == {"kind": "open"}
+    assert begun.wait(60)
+    begun.clear()
+    empty.answer({"kind": "open", "names": ["model\\b.obj"]}, [b"second"])
+    assert begun.wait(60)
+    assert seen == [first, {"model/b.obj": b"second"}]
+    assert empty.version == 1
+    go.set()
+    empty.progress.wait()
+    assert empty.version == 2  # the second one alone
+    empty.answer({"kind": "open", "names": ["model/c.obj"]}, [b"broken"])
+    with pytest.raises(ValueError, match=r"^model/c.obj must be whole, got a part"):
+        empty.progress.wait()
+    assert empty.version == 2
+
+
+def test_the_page_opens_a_scene_that_is_dropped_with_a_camera_of_its_own(browser, empty, systems, lights):
+    empty.show(systems, environments=lights)
+    empty.progress.finish()
+    closer = dataclasses.replace(systems["lobes"].camera, eye=np.array([1.0, 0.75, 2.0], np.float32))
+    other = eqx.tree_at(lambda relit: relit.camera, systems["harmonics"], closer)
+
+    def opener(paths):
+        assert [path.name for path in paths] == ["a.obj", "a.mtl"]
+        empty.show_unshadowed(Unshadowed.of(other.scene, prt.relit.Harmonics(2)), name="lobes", environments=lights)
+        empty.show({"lobes": other})
+
+    empty.opener = opener
+    server = Server(empty)
+    hand = Hand(browser, server.url)
+    hand.drag((100, 100), (140, 120))
+    drop = f"""() => {{ const data = new DataTransfer();
+        for (const name of ["a.obj", "a.mtl"]) data.items.add(new File(["text"], name));
+        const fields = {{ dataTransfer: data, bubbles: true, composed: true }};
+        ({CANVAS}).dispatchEvent(new DragEvent("drop", fields)); }}"""
+    hand.page.evaluate(drop)
+    hand.page.wait_for_function(
+        f"() => Math.abs(({CANVAS}).camera().distance - {np.hypot(np.hypot(1.0, 0.75), 2.0)}) < 1e-4"
+    )
+    hand.settle()
+    assert hand.page.get_by_role("button", name="undo").is_disabled()
+    assert not hand.errors
+    hand.page.close()
     server.close()

@@ -21,7 +21,7 @@ export const HELP = [
   [`${keys("Alt")}-click`, "open the material of a part"],
   [`${keys("Shift")}-drag, ${keys("[ ]")}`, "turn the light"],
   [keys("L"), "next light"],
-  ["drop a file", "an HDR or EXR file as another light, or a saved state"],
+  ["drop files", "a scene with what belongs to it, HDR or EXR files as other lights, or a saved state"],
   [keys("C"), "remove the suns"],
   [keys(", ."), "exposure"],
   [keys("A"), "automatic exposure"],
@@ -120,7 +120,7 @@ export function gestures(canvas, frame, on) {
   for (const [name, each] of Object.entries(listen)) canvas.addEventListener(name, each, { passive: false });
   frame.addEventListener("keydown", typed);
   frame.addEventListener("dragover", (event) => event.preventDefault());
-  frame.addEventListener("drop", (event) => { event.preventDefault(); if (on.camera && event.dataTransfer.files[0]) on.drop(event.dataTransfer.files[0]); });
+  frame.addEventListener("drop", (event) => { event.preventDefault(); dropped(event.dataTransfer).then((files) => files.length && on.drop(files)); });
   return {
     get held() { return points.size > 0 || swing !== null; },
     close() {
@@ -129,6 +129,23 @@ export function gestures(canvas, frame, on) {
       frame.removeEventListener("keydown", typed);
     },
   };
+}
+
+// The files that were dropped, with those in folders, each with its place.
+async function dropped(data) {
+  const entries = [...data.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean), files = [...data.files].map((file) => ({ place: file.name, file }));
+  if (!entries.some((entry) => entry.isDirectory)) return files;
+  const found = [], walk = async (entry) => {
+    if (entry.isFile) return found.push({ place: entry.fullPath.slice(1), file: await new Promise((resolve, reject) => entry.file(resolve, reject)) });
+    const reader = entry.createReader();
+    for (;;) { // browsers tell some at a time
+      const some = await new Promise((resolve, reject) => reader.readEntries(resolve, reject));
+      if (!some.length) return;
+      for (const each of some) await walk(each);
+    }
+  };
+  for (const entry of entries) await walk(entry);
+  return found;
 }
 
 function key(event, on) {

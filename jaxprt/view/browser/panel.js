@@ -70,8 +70,8 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
   const tint = element("input", row(lightPart, "sun color"), { type: "color", value: "#fff0d8" });
   const buttons = element("div", lightPart, { className: "row" });
   const clear = element("button", buttons, { textContent: "remove suns", type: "button", className: "clear", onclick: () => set({ lamps: [] }) });
-  const file = element("input", lightPart, { type: "file", accept: ".hdr,.exr,.png,.jpg", hidden: true });
-  file.onchange = () => { if (file.files[0]) open(file.files[0]); file.value = ""; };
+  const file = element("input", lightPart, { type: "file", accept: ".hdr,.exr,.png,.jpg", multiple: true, hidden: true });
+  file.onchange = () => { if (file.files.length) open([...file.files]); file.value = ""; };
   element("button", buttons, { textContent: "open a light…", type: "button", title: "an HDR or EXR file, which can be dropped on the picture, too", onclick: () => file.click() });
   const strip = stripOf(sky, tint, state, set);
 

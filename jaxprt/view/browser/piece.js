@@ -545,6 +545,7 @@ class Answers {
       case "page": return { content: { ...content, kind: "page", system: Object.keys(content.scene.systems)[0] }, buffers: all.slice(2) };
       case "look": return this.look(message);
       case "sky": return this.sky(message);
+      case "open": throw new Error("other scenes are opened by jaxprt view; drop a light");
       default: return this.drop(message, buffers[0]);
     }
   }

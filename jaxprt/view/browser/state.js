@@ -72,5 +72,8 @@ export class History {
     this.at = to;
     this.told((this.states[to] = this.take()));
   }
+  // The present state is not another one, though it may have changed: a better scene has come.
+  amend() { if (this.at >= 0) this.states[this.at] = this.take() || this.states[this.at]; }
+  forget() { Object.assign(this, { states: [], at: -1 }); }
   close() { clearTimeout(this.timer); }
 }

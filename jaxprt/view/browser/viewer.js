@@ -13,6 +13,8 @@ import { frameOf } from "./frame.js";
 import { materials, video } from "./saving.js";
 import { Waiting, follow } from "./waiting.js";
 
+const MESHES = /\.(glb|gltf|obj|ply|stl|off)$/i; // of files that are scenes
+const LIGHTS = /\.(hdr|exr|pic|json)$/i; // what does not belong to scenes
 const SKY_ROWS = 1024; // of the picture of a light at rest, if its file has so many
 
 const TRIES = 3; // answers of Python until their time counts: the first ones wait for compilers
@@ -295,18 +297,33 @@ export function mount(root, ask, { addressed = false } = {}) {
     scene.lights = lights;
     if (gpu) buffers.forEach((each, i) => { gpu.piece.lights[light + i] = new Float32Array(each.buffer, each.byteOffset, each.byteLength / 4); });
   };
-  const drop = async (file) => {
-    if (/\.json$/i.test(file.name)) {
-      try { return give(await file.text()); } catch (error) { return tell(`${file.name}: ${error.message}`); }
-    }
-    if (file.size > 2 ** 29) return tell(`${file.name} must have at most 512 MiB, and has ${Math.ceil(file.size / 2 ** 20)}`);
+  const sent = async (kind, fields, files) => {
+    for (const file of files) if (file.size > 2 ** 29) throw new Error(`${file.name} must have at most 512 MiB, and has ${Math.ceil(file.size / 2 ** 20)}`);
+    const data = await Promise.all(files.map((file) => file.arrayBuffer()));
+    const { content, buffers } = await waiting.during("drop", `reading ${files.map((file) => file.name).join(", ")}`, ask({ kind, ...fields }, data).catch((error) => { throw new Error(`no answer from Python: ${error.message}`); }), 0);
+    if (content.kind === "error") throw new Error(content.message);
+    return { content, buffers };
+  };
+  // Files that were dropped: a scene with all that belongs to it, or lights, or a state.
+  const drop = async (files) => {
     try {
-      const sent = ask({ kind: "drop", name: file.name }, [await file.arrayBuffer()]);
-      const { content, buffers } = await waiting.during("drop", `reading ${file.name}`, sent, 0);
-      if (content.kind === "error") { stats.errors++; return tell(content.message); }
-      took(content, buffers);
-      set({ light: content.light, lamps: [] });
-    } catch (error) { stats.errors++; tell(`no answer from Python: ${error.message}`); }
+      const opens = files.some(({ place }) => MESHES.test(place)), parts = files.filter(({ place }) => opens && !LIGHTS.test(place));
+      for (const { file } of files.filter((each) => !parts.includes(each))) {
+        if (/\.json$/i.test(file.name)) {
+          try { give(await file.text()); } catch (error) { throw new Error(`${file.name}: ${error.message}`); }
+          continue;
+        }
+        const { content, buffers } = await sent("drop", { name: file.name }, [file]);
+        took(content, buffers);
+        set({ light: content.light, lamps: [] });
+      }
+      if (!opens) return;
+      await sent("open", { names: parts.map(({ place }) => place) }, parts.map(({ file }) => file));
+      start();
+    } catch (error) {
+      stats.errors++;
+      tell(error.message);
+    }
   };
   const reset = () => { camera = new Camera(scene); exposed = null; set({ turn: 0, lamps: [], materials: {}, auto: true }); };
   // What is seen at a place of the picture, from -1 to 1: the point, and the part that it belongs to.
@@ -423,13 +440,19 @@ export function mount(root, ask, { addressed = false } = {}) {
       // The GPU goes on with direct light until the programs of bounces are compiled.
       if (had !== has) [bouncing, state.bounces] = [has && gpu !== null && !loaded.finished, has];
       if (bouncing) state.bounces = false;
+      const another = scene && loaded.scene !== scene.scene;
       scene = Object.assign(scene ?? {}, loaded);
       [bytes, exposed] = [null, null]; // an automatic exposure is found for each better scene
       const first = !camera;
+      if (another) {
+        [camera, state.materials, opened] = [null, {}, ""];
+        past.forget();
+        view.steps(false, false);
+      }
       camera ??= new Camera(scene);
       drawing.setMesh(scene.position, scene.face, scene.backs);
       if (controlled !== panelled) {
-        controls = panelOf(panel, scene, state, { set, expose, automatic, map, moved, widen, camera: () => camera, open: drop });
+        controls = panelOf(panel, scene, state, { set, expose, automatic, map, moved, widen, camera: () => camera, open: (files) => drop(files.map((file) => ({ place: file.name, file }))) });
         if (root.parentElement === document.body && document.activeElement === document.body) canvas.focus({ preventScroll: true }); // a page of the viewer alone: keys work at once
         [panelled, skyKey] = [controlled, {}];
       }
@@ -437,6 +460,7 @@ export function mount(root, ask, { addressed = false } = {}) {
       resize();
       if (first && addressed && location.hash.length > 1) arrived();
       moved();
+      past.amend();
     } catch (error) {
       tell(`no answer from Python: ${error.message}`);
       if (!closed) setTimeout(load, 1000);
