@@ -12,7 +12,7 @@ import tqdm
 from click.shell_completion import get_completion_class
 
 import jaxprt
-from jaxprt.cli import dataset, export, info, inputs, measure, options, planned, play, relight
+from jaxprt.cli import dataset, export, info, inputs, lights, measure, options, planned, play, relight
 from jaxprt.relit import registry
 
 _INTERRUPTED = 130
@@ -58,7 +58,7 @@ Materials, for --brdf and --material:
 
 @click.group(
     cls=Program,
-    commands=[module.command for module in (relight, play, planned, measure, export, dataset, info)],
+    commands=[module.command for module in (relight, lights, play, planned, measure, export, dataset, info)],
     epilog=_EPILOG,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
 )

@@ -118,7 +118,7 @@ def test_one_finger_orbits_and_two_zoom_and_pan(hand, touch):
     assert turned["azimuth"] == pytest.approx(first["azimuth"] - 0.4)
     assert turned["elevation"] == pytest.approx(first["elevation"] + 0.2)
     assert turned["distance"] == first["distance"]
-    touch([(100, 100), (160, 100)], [(70, 100), (190, 100)])  # twice as far apart around the same middle
+    touch([(130, 160), (190, 160)], [(100, 160), (220, 160)])  # twice as far apart around the middle of the picture
     pinched = hand.camera()
     assert pinched["distance"] == pytest.approx(first["distance"] / 2)
     assert pinched["azimuth"] == turned["azimuth"]
@@ -147,7 +147,7 @@ def test_a_point_in_the_plane_and_a_color_change_the_material(hand):
     before = hand.pixels()
     hand.drag((box["x"] + 20, box["y"] + 100), (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2))
     assert hand.state()["materials"]["ball"] == pytest.approx({"roughness": 0.5, "f0": 0.25}, abs=0.02)
-    hand.page.locator("input[type=color]").nth(1).fill("#0000ff")
+    hand.page.get_by_label("base color").first.fill("#0000ff")
     hand.settle()
     assert hand.state()["materials"]["ball"]["diffuse"] == pytest.approx([0, 0, 1])
     assert np.abs(hand.pixels() - before).max() > 0.1

@@ -385,6 +385,29 @@ def test_it_starts_at_the_automatic_exposure_of_the_object_in_each_light(hand, s
         hand.settle()
 
 
+def test_the_scene_is_shown_small_in_each_light_and_a_click_takes_it(hand, systems, lights):
+    buttons = [hand.page.get_by_role("button", name=f"light: {name}") for name in lights]
+    for number, button in enumerate(buttons):
+        button.wait_for()
+        assert button.get_attribute("aria-pressed") == str(number == 0).lower()
+    small = hand.page.evaluate(
+        f"""() => [...{ROOT}.querySelectorAll(".gallery canvas")].map((canvas) =>
+            Array.from(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data))"""
+    )
+    camera = hand.camera()
+    eye = Camera(camera["eye"], camera["target"], [0.0, 1.0, 0.0], camera["angle"], 72, 54)
+    cover = np.asarray(systems["lobes"].coverage(eye)) == 1
+    for pixel, light in zip(small, lights.values(), strict=True):
+        picture = systems["lobes"].picture(light, eye, shadows="vertices")
+        expected = np.asarray(image.display(picture, stops=systems["lobes"].exposure(picture, eye)))
+        off = np.abs(np.reshape(pixel, (54, 72, 4))[..., :3] / 255 - expected)[cover]
+        assert off.mean() < 0.04
+    buttons[1].click()
+    hand.settle()
+    assert hand.state()["light"] == 1
+    assert buttons[1].get_attribute("aria-pressed") == "true"
+
+
 def saved(hand, width, height, *, transparent):
     """The pixels of a picture that the dialog saves, in [0, 1]."""
     hand.page.get_by_role("button", name="save a picture").click()

@@ -24,7 +24,7 @@ from jaxprt.view.reduced import PageScene
 pytestmark = pytest.mark.filterwarnings("ignore:the page has light of bounces in part")
 
 LEFT_OUT = "light of bounces in part: these parts reflect it diffusely, without highlights: 'ball'$"
-SHOWN = 'mount(document.getElementById("viewer"), answers(content, buffers));'
+SHOWN = 'mount(document.getElementById("viewer"), answers(content, buffers), { addressed: true });'
 ASKED = """async (message) => {
   const { content, buffers } = await window.ask(message, message.file ? [Uint8Array.from(message.file).buffer] : []);
   return { content, data: buffers.length ? Array.from(new Uint16Array(buffers[0].buffer)) : [] };

@@ -63,8 +63,8 @@ SHADES = """async ({ module, data, message, angle, radius, backs, size }) => {
   const error = gl.getError(), slow = pixels.slow;
   pixels.close();
   const { blends } = piece, listed = (data, there) => (there ? Array.from(data) : null);
-  const data = listed(read.data, true);
-  return { error, slow, edge, data, first: listed(first, !blends), saved: listed(saved, blends) };
+  const shown = { data: listed(read.data, true), first: listed(first, !blends), saved: listed(saved, blends) };
+  return { error, slow, edge, ...shown };
 }"""
 
 
@@ -322,6 +322,8 @@ def test_light_view_and_material_change_without_python(browser, systems, lights)
     bare = systems["lobes"].without_bounces()
     server = Server(session := Counted(bare, environments=lights))
     hand = by_gpu(browser, server.url)
+    for name in lights:  # small pictures of both lights, which Python makes once
+        hand.page.get_by_role("button", name=f"light: {name}").wait_for()
     before = session.asked["look"]
     hand.drag((100, 100), (160, 130))
     hand.page.keyboard.press("l")

@@ -125,9 +125,8 @@ export class Drawing {
     gl.enableVertexAttribArray(1);
     if (encoded) gl.vertexAttribPointer(1, 3, gl.UNSIGNED_BYTE, true, 3, 0);
     else gl.vertexAttribPointer(1, 3, gl.HALF_FLOAT, false, 6, 0);
-    this.encoded = encoded;
-    this.scale = scale;
-    this.drawn = true;
+    [this.encoded, this.scale, this.drawn] = [encoded, scale, true];
+    this.given = [data, encoded, scale];
   }
   texture(data, width, height, encoded, repeat, alpha = false) {
     const gl = this.gl, handle = gl.createTexture();
@@ -305,6 +304,17 @@ export class Drawing {
     for (const frame of [many, one]) gl.deleteFramebuffer(frame);
     for (const each of buffers) gl.deleteRenderbuffer(each);
     return result;
+  }
+  // A small picture by other colors of the vertices in half floats, at an exposure of its own.
+  thumbnail(camera, state, center, size, [data, scale]) {
+    const { gpu, given } = this;
+    this.gpu = null;
+    this.setColor(data, false, scale);
+    const stops = this.exposure(camera, state, center) ?? 0, pixel = this.pixels(camera, { ...state, stops, background: "none" }, center, size);
+    this.gpu = gpu;
+    if (given) this.setColor(...given);
+    else this.drawn = false;
+    return pixel;
   }
   // Stops at which the brightest surfaces that are seen come near white, as `jaxprt.image.automatic_exposure` has them:
   // the 99th percentile of luminance over pixels that surfaces fill is 0.9. Null where no surface is seen, or all is black.

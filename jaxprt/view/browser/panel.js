@@ -61,6 +61,9 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
 
   const lightPart = section(panel, "Light");
   const light = choice(lightPart, "light", scene.lights, (i) => set({ light: i }));
+  const gallery = element("div", lightPart, { className: "gallery", hidden: true });
+  gallery.setAttribute("role", "group");
+  gallery.setAttribute("aria-label", "the scene in each light");
   const sides = { low: -180, high: 180, step: 1, digits: 1, wrap: (x) => ((((x + 180) % 360) + 360) % 360) - 180 };
   const turn = slider(lightPart, "rotation °", sides, (degrees) => set({ turn: degrees * DEGREE }));
   const sky = element("canvas", lightPart, { className: "sky", width: 256, height: 128, tabIndex: 0, title: "the light as it is turned; the mark at its lower edge is where the camera looks" });
@@ -105,6 +108,7 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
     show() {
       if (light.length !== scene.lights.length) light.fill(scene.lights);
       light.value = state.light;
+      [...gallery.children].forEach((button, i) => button.setAttribute("aria-pressed", String(i === state.light)));
       turn.show(sides.wrap(state.turn / DEGREE));
       if (system) system.value = names.indexOf(state.system);
       exposure.show(state.stops);
@@ -117,6 +121,19 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
       for (const [key, each] of boxes) each.checked = state[key];
       for (const part of parts.values()) part.show();
       strip.show();
+    },
+    // Shows a picture of the scene in a light, RGBA from below, in whose place a click puts the light.
+    thumbnail(number, pixel, width, height) {
+      while (gallery.children.length <= number) {
+        const at = gallery.children.length, name = scene.lights[at], button = element("button", gallery, { type: "button", title: name, onclick: () => set({ light: at }) });
+        button.setAttribute("aria-label", `light: ${name}`);
+        element("canvas", button, { width, height });
+      }
+      const context = gallery.children[number].firstChild.getContext("2d"), image = context.createImageData(width, height);
+      for (let y = 0; y < height; y++) image.data.set(pixel.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
+      context.putImageData(image, 0, 0);
+      gallery.hidden = false;
+      this.show();
     },
     paint: strip.paint,
     look: strip.look,

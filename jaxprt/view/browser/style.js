@@ -38,6 +38,9 @@ kbd { font: inherit; font-weight: 600; padding: 0 4px; border: 1px solid var(--e
 .help td { padding: 1px 12px 1px 0; vertical-align: top; }
 .help td:first-child { white-space: nowrap; }
 .panel { width: 264px; overflow-y: auto; overscroll-behavior: contain; padding: 4px 10px 12px; background: var(--card); border-left: 1px solid var(--edge); scrollbar-width: thin; }
+.gallery { display: flex; gap: 4px; overflow-x: auto; padding: 2px 0 4px; }
+.gallery button { flex: 0 0 auto; padding: 1px; line-height: 0; border-radius: 4px; }
+.gallery button[aria-pressed="true"] { outline: 2px solid var(--mark); }
 .panel summary { cursor: pointer; padding: 4px 0; border-radius: 4px; overflow: hidden; text-overflow: ellipsis; white-space: nowrap; }
 .panel > details > summary { font-weight: 600; color: var(--mark); }
 .panel > details + details { border-top: 1px solid var(--edge); }

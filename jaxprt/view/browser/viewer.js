@@ -15,6 +15,7 @@ import { Waiting, follow } from "./waiting.js";
 
 const MESHES = /\.(glb|gltf|obj|ply|stl|off)$/i; // of files that are scenes
 const LIGHTS = /\.(hdr|exr|pic|json)$/i; // what does not belong to scenes
+const SMALL = { width: 72, height: 54 }; // pixels of the pictures of lights in the panel
 const SKY_ROWS = 1024; // of the picture of a light at rest, if its file has so many
 
 const TRIES = 3; // answers of Python until their time counts: the first ones wait for compilers
@@ -196,7 +197,27 @@ export function mount(root, ask, { addressed = false } = {}) {
       redraw();
     } catch { skyKey = {}; }
   };
-  const rested = () => { if (!long) sky(SKY_ROWS); still(); };
+  const rested = async () => {
+    if (!long) sky(SKY_ROWS);
+    await still();
+    if (!long) thumbnails();
+  };
+  // Small pictures of the scene in each light, while nothing moves: of what was there when each was made.
+  const small = new Map();
+  const thumbnails = async () => {
+    const own = seq, { width, height } = SMALL;
+    if (scene.lights.length < 2 || !scene.rests.length) return;
+    for (let light = small.size; light < scene.lights.length && own === seq && !closed; light++) {
+      try {
+        const { content, buffers } = await ask({ ...message("look"), light, turn: 0, lamps: [], stops: null, vertices: "all" });
+        if (closed || content.kind !== "color" || small.has(light)) return;
+        const data = new Uint16Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 2);
+        small.set(light, drawing.thumbnail(camera, state, scene.center, SMALL, [data, content.scale]));
+        controls?.thumbnail(light, small.get(light), width, height);
+        redraw();
+      } catch { return; }
+    }
+  };
   // At rest: the picture at pixels, then the exact one. Where they take long a coarse one comes first. The first picture
   // of a size does not count: its programs are compiled. Python gives up what it is at when the next look comes.
   const still = async () => {
@@ -456,6 +477,7 @@ export function mount(root, ask, { addressed = false } = {}) {
         if (root.parentElement === document.body && document.activeElement === document.body) canvas.focus({ preventScroll: true }); // a page of the viewer alone: keys work at once
         [panelled, skyKey] = [controlled, {}];
       }
+      small.clear(); // of a scene with fewer shadows
       controls.show();
       resize();
       if (first && addressed && location.hash.length > 1) arrived();
