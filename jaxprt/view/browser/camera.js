@@ -19,8 +19,14 @@ export class Camera {
     const c = Math.cos(this.elevation);
     return [Math.sin(this.azimuth) * c, Math.sin(this.elevation), Math.cos(this.azimuth) * c];
   }
-  get eye() { return add(this.target, this.back, this.distance); }
-  get axes() { const z = this.back, x = unit(cross([0, 1, 0], z)); return [x, cross(z, x), z]; }
+  get eye() {
+    return add(this.target, this.back, this.distance);
+  }
+  get axes() {
+    const z = this.back;
+    const x = unit(cross([0, 1, 0], z));
+    return [x, cross(z, x), z];
+  }
   orbit(dx, dy) {
     this.azimuth -= dx;
     this.elevation = clamp(this.elevation + dy, -1.55, 1.55);
@@ -31,11 +37,14 @@ export class Camera {
     result.azimuth += angle;
     return result;
   }
-  pan(dx, dy) { // of the height of the picture
-    const [x, y] = this.axes, step = 2 * this.distance * Math.tan(this.angle / 2);
+  pan(dx, dy) {
+    // of the height of the picture
+    const [x, y] = this.axes;
+    const step = 2 * this.distance * Math.tan(this.angle / 2);
     this.target = add(add(this.target, x, -dx * step), y, dy * step);
   }
-  // What is seen at a place, to the right and down from the middle in heights of the picture, stays there, as far away as the target.
+  // What is seen at a place, to the right and down from the middle in heights of the picture, stays there, as far
+  // away as the target.
   zoom(factor, [x, y] = [0, 0]) {
     const before = this.distance;
     this.distance = clamp(before * factor, 1e-3 * this.radius, 1e3 * this.radius);
@@ -51,18 +60,30 @@ export class Camera {
   frame(low, high, aspect) {
     this.target = add(low, high).map((x) => x / 2);
     const half = Math.min(this.angle / 2, Math.atan(aspect * Math.tan(this.angle / 2)));
-    this.distance = clamp(Math.hypot(...add(high, low, -1)) / 2 / Math.sin(half), 1e-3 * this.radius, 1e3 * this.radius);
+    this.distance = clamp(
+      Math.hypot(...add(high, low, -1)) / 2 / Math.sin(half),
+      1e-3 * this.radius,
+      1e3 * this.radius,
+    );
   }
-  ray(aspect) { // columns: to the right, up and forward, for coordinates from -1 to 1
-    const [x, y, z] = this.axes, t = Math.tan(this.angle / 2);
+  ray(aspect) {
+    // columns: to the right, up and forward, for coordinates from -1 to 1
+    const [x, y, z] = this.axes;
+    const t = Math.tan(this.angle / 2);
     return [...x.map((v) => v * t * aspect), ...y.map((v) => v * t), ...z.map((v) => -v)];
   }
   matrix(aspect, center) {
-    const [x, y, z] = this.axes, e = this.eye, f = 1 / Math.tan(this.angle / 2);
-    const away = Math.hypot(...add(e, center, -1)), far = away + 2 * this.radius;
+    const [x, y, z] = this.axes;
+    const e = this.eye;
+    const f = 1 / Math.tan(this.angle / 2);
+    const away = Math.hypot(...add(e, center, -1));
+    const far = away + 2 * this.radius;
     const near = Math.max(away - 2 * this.radius, this.distance / 100, far / 1e5);
-    const a = (far + near) / (near - far), b = (2 * far * near) / (near - far), rows = [x, y, z];
-    const scale = [f / aspect, f, a], result = new Float32Array(16);
+    const a = (far + near) / (near - far);
+    const b = (2 * far * near) / (near - far);
+    const rows = [x, y, z];
+    const scale = [f / aspect, f, a];
+    const result = new Float32Array(16);
     for (let i = 0; i < 3; i++) {
       for (let j = 0; j < 3; j++) result[4 * i + j] = rows[j][i] * scale[j];
       result[4 * i + 3] = -z[i];
@@ -75,16 +96,37 @@ export class Camera {
 
 // Where a ray meets the mesh first: the distance, or infinity, and the number of the triangle.
 export function meet(origin, way, position, face) {
-  let nearest = Infinity, triangle = -1;
+  let nearest = Infinity;
+  let triangle = -1;
   const [dx, dy, dz] = way;
   for (let i = 0; i < face.length; i += 3) {
-    const a = 3 * face[i], b = 3 * face[i + 1], c = 3 * face[i + 2], ax = position[a], ay = position[a + 1], az = position[a + 2];
-    const ex = position[b] - ax, ey = position[b + 1] - ay, ez = position[b + 2] - az, fx = position[c] - ax, fy = position[c + 1] - ay, fz = position[c + 2] - az;
-    const px = dy * fz - dz * fy, py = dz * fx - dx * fz, pz = dx * fy - dy * fx, det = ex * px + ey * py + ez * pz;
+    const a = 3 * face[i];
+    const b = 3 * face[i + 1];
+    const c = 3 * face[i + 2];
+    const ax = position[a];
+    const ay = position[a + 1];
+    const az = position[a + 2];
+    const ex = position[b] - ax;
+    const ey = position[b + 1] - ay;
+    const ez = position[b + 2] - az;
+    const fx = position[c] - ax;
+    const fy = position[c + 1] - ay;
+    const fz = position[c + 2] - az;
+    const px = dy * fz - dz * fy;
+    const py = dz * fx - dx * fz;
+    const pz = dx * fy - dy * fx;
+    const det = ex * px + ey * py + ez * pz;
     if (det === 0) continue;
-    const sx = origin[0] - ax, sy = origin[1] - ay, sz = origin[2] - az, u = (sx * px + sy * py + sz * pz) / det;
+    const sx = origin[0] - ax;
+    const sy = origin[1] - ay;
+    const sz = origin[2] - az;
+    const u = (sx * px + sy * py + sz * pz) / det;
     if (u < 0 || u > 1) continue;
-    const qx = sy * ez - sz * ey, qy = sz * ex - sx * ez, qz = sx * ey - sy * ex, v = (dx * qx + dy * qy + dz * qz) / det, t = (fx * qx + fy * qy + fz * qz) / det;
+    const qx = sy * ez - sz * ey;
+    const qy = sz * ex - sx * ez;
+    const qz = sx * ey - sy * ex;
+    const v = (dx * qx + dy * qy + dz * qz) / det;
+    const t = (fx * qx + fy * qy + fz * qz) / det;
     if (v >= 0 && u + v <= 1 && t > 0 && t < nearest) [nearest, triangle] = [t, i / 3];
   }
   return { distance: nearest, triangle };

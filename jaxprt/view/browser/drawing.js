@@ -71,7 +71,12 @@ export class Drawing {
   constructor(canvas) {
     this.canvas = canvas;
     this.gpu = null; // shades pixels; null where colors come from Python
-    [this.unexposed, this.exposed] = [false, null]; // whether the next picture is measured, and what is called with its exposure
+    this.unexposed = false; // whether the next picture is measured
+    this.exposed = null; // what is called with its exposure
+    this.skyScale = this.skyHeight = 1;
+    this.coarseSky = null;
+    this.encoded = this.drawn = false; // whether colors are those of the display, and whether there are any
+    this.scale = 1;
     const gl = (this.gl = canvas.getContext("webgl2", { alpha: false, antialias: true, preserveDrawingBuffer: true }));
     if (!gl) throw new Error("this browser has no WebGL2, which the viewer needs");
     this.build();
@@ -81,11 +86,15 @@ export class Drawing {
     gl.programs = new Map(); // those of a context that was lost are gone
     const program = (vertex, fragment) => {
       const handle = gl.createProgram();
-      for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+      for (const [kind, text] of [
+        [gl.VERTEX_SHADER, vertex],
+        [gl.FRAGMENT_SHADER, fragment],
+      ]) {
         const shader = gl.createShader(kind);
         gl.shaderSource(shader, text);
         gl.compileShader(shader);
-        if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) throw new Error(gl.getShaderInfoLog(shader));
+        if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost())
+          throw new Error(gl.getShaderInfoLog(shader));
         gl.attachShader(handle, shader);
       }
       gl.linkProgram(handle);
@@ -99,12 +108,15 @@ export class Drawing {
     this.still = program(QUAD, STILL);
     this.empty = gl.createVertexArray();
     this.array = gl.createVertexArray();
-    [this.position, this.color, this.index] = [0, 1, 2].map(() => gl.createBuffer());
+    this.position = gl.createBuffer();
+    this.color = gl.createBuffer();
+    this.index = gl.createBuffer();
     this.skyImage = this.blurredImage = null;
     this.gpu?.build();
     this.stills = []; // pictures at rest: the last one appears over the one before
   }
-  setMesh(position, face, backs) { // of faces after the first `backs` no backs are seen
+  setMesh(position, face, backs) {
+    // of faces after the first `backs` no backs are seen
     const gl = this.gl;
     gl.bindVertexArray(this.array);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.position);
@@ -129,24 +141,46 @@ export class Drawing {
     this.given = [data, encoded, scale];
   }
   texture(data, width, height, encoded, repeat, alpha = false) {
-    const gl = this.gl, handle = gl.createTexture();
+    const gl = this.gl;
+    const handle = gl.createTexture();
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, handle);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     const [form, bytes, halves] = alpha ? [gl.RGBA, gl.RGBA8, gl.RGBA16F] : [gl.RGB, gl.RGB8, gl.RGB16F];
-    gl.texImage2D(gl.TEXTURE_2D, 0, encoded ? bytes : halves, width, height, 0, form, encoded ? gl.UNSIGNED_BYTE : gl.HALF_FLOAT, data);
+    gl.texImage2D(
+      gl.TEXTURE_2D,
+      0,
+      encoded ? bytes : halves,
+      width,
+      height,
+      0,
+      form,
+      encoded ? gl.UNSIGNED_BYTE : gl.HALF_FLOAT,
+      data,
+    );
     for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.LINEAR);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, repeat ? gl.REPEAT : gl.CLAMP_TO_EDGE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
     return handle;
   }
-  setSky(data, { width, height, scale, levels = 1 }) { // levels: pictures of half the size follow, as mip maps
+  setSky(data, { width, height, scale, levels = 1 }) {
+    // levels: pictures of half the size follow, as mip maps
     const gl = this.gl;
     if (this.skyImage) gl.deleteTexture(this.skyImage);
     this.skyImage = this.texture(data, width, height, false, true);
     for (let level = 1, first = 3 * width * height; level < levels; level++) {
       const [w, h] = [width >> level, height >> level];
-      gl.texImage2D(gl.TEXTURE_2D, level, gl.RGB16F, w, h, 0, gl.RGB, gl.HALF_FLOAT, data.subarray(first, first += 3 * w * h));
+      gl.texImage2D(
+        gl.TEXTURE_2D,
+        level,
+        gl.RGB16F,
+        w,
+        h,
+        0,
+        gl.RGB,
+        gl.HALF_FLOAT,
+        data.subarray(first, (first += 3 * w * h)),
+      );
     }
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, levels - 1);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
@@ -158,14 +192,21 @@ export class Drawing {
   }
   // The light as it is seen, its brightness, and the level of detail of its image; null where it is not the background.
   behind(camera, state, height) {
-    if (state.background === "light" && this.skyImage) return { image: this.skyImage, lod: Math.log2((2 * Math.tan(camera.angle / 2) * this.skyHeight) / (height * Math.PI)) };
+    if (state.background === "light" && this.skyImage)
+      return {
+        image: this.skyImage,
+        lod: Math.log2((2 * Math.tan(camera.angle / 2) * this.skyHeight) / (height * Math.PI)),
+      };
     if (state.background !== "blurred light" || !this.skyImage) return null;
     this.blurredImage ??= this.texture(blurred(this.coarseSky), 2 * BLURRED, BLURRED, false, true);
     return { image: this.blurredImage, lod: 0 };
   }
   // What the mesh is drawn on, in colors of the display.
-  ground(state) { return [...(state.background === "color" ? state.ground : [0.1, 0.1, 0.1]), 1]; }
-  addStill(data, width, height, encoded, scale, cover = null) { // cover: bytes of alpha, where no background is seen
+  ground(state) {
+    return [...(state.background === "color" ? state.ground : [0.1, 0.1, 0.1]), 1];
+  }
+  addStill(data, width, height, encoded, scale, cover = null) {
+    // cover: bytes of alpha, where no background is seen
     this.dropStills(1);
     let all = data;
     if (cover) {
@@ -175,9 +216,17 @@ export class Drawing {
         all[4 * i + 3] = encoded ? cover[i] : toHalf(cover[i] / 255);
       }
     }
-    this.stills.push({ image: this.texture(all, width, height, encoded, false, cover !== null), encoded, scale, clear: cover !== null, since: performance.now() });
+    this.stills.push({
+      image: this.texture(all, width, height, encoded, false, cover !== null),
+      encoded,
+      scale,
+      clear: cover !== null,
+      since: performance.now(),
+    });
   }
-  dropStills(kept) { while (this.stills.length > kept) this.gl.deleteTexture(this.stills.shift().image); }
+  dropStills(kept) {
+    while (this.stills.length > kept) this.gl.deleteTexture(this.stills.shift().image);
+  }
   quad(program, image, gain, encoded, tone) {
     const gl = this.gl;
     gl.useProgram(program.handle);
@@ -191,11 +240,15 @@ export class Drawing {
   // The sky and the mesh, on a ground of one color, in the framebuffer of the moment: an image of shaded pixels, or
   // colors at vertices without one.
   paint(camera, state, center, { width, height }, ground, image = null, surfaces = true) {
-    const gl = this.gl, gpu = this.gpu, gain = 2 ** state.stops, tone = TONES.indexOf(state.tone);
+    const gl = this.gl;
+    const gpu = this.gpu;
+    const gain = 2 ** state.stops;
+    const tone = TONES.indexOf(state.tone);
     gl.viewport(0, 0, width, height);
     gl.clearColor(...ground);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    const sky = this.behind(camera, state, height), through = sky && image && gpu.piece.blends && surfaces; // light adds up before it is displayed
+    const sky = this.behind(camera, state, height);
+    const through = sky && image && gpu.piece.blends && surfaces; // light adds up before it is displayed
     if (sky) {
       const program = through ? this.through : this.sky;
       if (through) this.quad(program, image.handle, gain, false, tone);
@@ -233,7 +286,8 @@ export class Drawing {
   // Draws a frame: true if another one is to follow. `python` says whether pictures at rest come from there, and `fresh`
   // whether more has changed than what pixels show.
   draw(camera, state, center, now, python, fresh) {
-    const { gl, gpu } = this, { width, height } = this.canvas;
+    const { gl, gpu } = this;
+    const { width, height } = this.canvas;
     if (gpu?.busy) {
       this.late ||= fresh;
       return true;
@@ -245,13 +299,15 @@ export class Drawing {
       this.unexposed = false;
       this.exposed(this.exposure(camera, state, center));
     }
-    const gain = 2 ** state.stops, tone = TONES.indexOf(state.tone);
+    const gain = 2 ** state.stops;
+    const tone = TONES.indexOf(state.tone);
     this.paint(camera, state, center, this.canvas, this.ground(state), gpu?.shown);
     let alpha = 1;
     gl.enable(gl.BLEND);
     for (const each of this.stills) {
       alpha = clamp((now - each.since) / FADE, 0, 1);
-      if (each.clear && alpha === 1) { // edges of what was drawn before lie beside its own
+      if (each.clear && alpha === 1) {
+        // edges of what was drawn before lie beside its own
         gl.disable(gl.BLEND);
         this.paint(camera, state, center, this.canvas, this.ground(state), null, false);
         gl.enable(gl.BLEND);
@@ -267,21 +323,32 @@ export class Drawing {
   backdrop(camera, state, center, width, height) {
     return { pixel: this.pixels(camera, state, center, { width, height }, null, 4, false), parts: 1 };
   }
-  // A picture of any size as rows of RGBA from below, colors times alpha, and how many of its pixels make one along an edge.
+  // A picture of any size as rows of RGBA from below, colors times alpha, and how many of its pixels make one along
+  // an edge.
   async picture(camera, state, center, width, height) {
-    const { gl, gpu } = this, most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    const { gl, gpu } = this;
+    const most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     if (Math.max(width, height) > most || width * height > MOST_PIXELS)
-      throw new Error(`a picture must have at most ${MOST_PIXELS} pixels, and ${most} along an edge in this browser, got ${width} x ${height}`);
-    if (!gpu?.floats) return { pixel: this.pixels(camera, state, center, { width: 2 * width, height: 2 * height }), parts: 2 };
-    const image = await gpu.whole(camera.matrix(width / height, center), width, height), pixel = this.pixels(camera, state, center, { width, height }, image);
+      throw new Error(
+        `a picture must have at most ${MOST_PIXELS} pixels, and ${most} along an edge in this browser, got ${width} x ${height}`,
+      );
+    if (!gpu?.floats)
+      return { pixel: this.pixels(camera, state, center, { width: 2 * width, height: 2 * height }), parts: 2 };
+    const image = await gpu.whole(camera.matrix(width / height, center), width, height);
+    const pixel = this.pixels(camera, state, center, { width, height }, image);
     gpu.dispose();
     return { pixel, parts: 1 };
   }
   // Bytes, RGBA from the lower left, of what is painted at a size of its own: an image of shaded pixels, or colors at
   // vertices without one. Alpha is 0 where there is only the ground.
   pixels(camera, state, center, { width, height }, image = null, mostSamples = 4, surfaces = true) {
-    const gl = this.gl, most = gl.getParameter(gl.MAX_RENDERBUFFER_SIZE), samples = Math.min(mostSamples, gl.getParameter(gl.MAX_SAMPLES));
-    if (Math.max(width, height) > most) throw new Error(`a picture must have at most ${most} pixels along an edge in this browser, got ${width} x ${height}`);
+    const gl = this.gl;
+    const most = gl.getParameter(gl.MAX_RENDERBUFFER_SIZE);
+    const samples = Math.min(mostSamples, gl.getParameter(gl.MAX_SAMPLES));
+    if (Math.max(width, height) > most)
+      throw new Error(
+        `a picture must have at most ${most} pixels along an edge in this browser, got ${width} x ${height}`,
+      );
     const buffer = (count, kind, place) => {
       const handle = gl.createRenderbuffer();
       gl.bindRenderbuffer(gl.RENDERBUFFER, handle);
@@ -289,11 +356,23 @@ export class Drawing {
       gl.framebufferRenderbuffer(gl.FRAMEBUFFER, place, gl.RENDERBUFFER, handle);
       return handle;
     };
-    const [many, one] = [gl.createFramebuffer(), gl.createFramebuffer()], result = new Uint8Array(4 * width * height);
+    const [many, one] = [gl.createFramebuffer(), gl.createFramebuffer()];
+    const result = new Uint8Array(4 * width * height);
     if (this.gpu && !image) this.gpu.piece.vertices(this.gpu.message);
     gl.bindFramebuffer(gl.FRAMEBUFFER, many);
-    const buffers = [buffer(samples, gl.RGBA8, gl.COLOR_ATTACHMENT0), buffer(samples, gl.DEPTH_COMPONENT24, gl.DEPTH_ATTACHMENT)];
-    this.paint(camera, state, center, { width, height }, state.background === "color" ? this.ground(state) : [0, 0, 0, 0], image, surfaces);
+    const buffers = [
+      buffer(samples, gl.RGBA8, gl.COLOR_ATTACHMENT0),
+      buffer(samples, gl.DEPTH_COMPONENT24, gl.DEPTH_ATTACHMENT),
+    ];
+    this.paint(
+      camera,
+      state,
+      center,
+      { width, height },
+      state.background === "color" ? this.ground(state) : [0, 0, 0, 0],
+      image,
+      surfaces,
+    );
     gl.bindFramebuffer(gl.FRAMEBUFFER, one);
     buffers.push(buffer(0, gl.RGBA8, gl.COLOR_ATTACHMENT0));
     gl.bindFramebuffer(gl.READ_FRAMEBUFFER, many);
@@ -310,40 +389,68 @@ export class Drawing {
     const { gpu, given } = this;
     this.gpu = null;
     this.setColor(data, false, scale);
-    const stops = this.exposure(camera, state, center) ?? 0, pixel = this.pixels(camera, { ...state, stops, background: "none" }, center, size);
+    const stops = this.exposure(camera, state, center) ?? 0;
+    const pixel = this.pixels(camera, { ...state, stops, background: "none" }, center, size);
     this.gpu = gpu;
     if (given) this.setColor(...given);
     else this.drawn = false;
     return pixel;
   }
   // Stops at which the brightest surfaces that are seen come near white, as `jaxprt.image.automatic_exposure` has them:
-  // the 99th percentile of luminance over pixels that surfaces fill is 0.9. Null where no surface is seen, or all is black.
+  // the 99th percentile of luminance over pixels that surfaces fill is 0.9. Null where no surface is seen, or all is
+  // black.
   exposure(camera, state, center) {
-    const height = 96, width = Math.max(1, Math.round((height * this.canvas.width) / this.canvas.height));
-    const pixel = this.pixels(camera, { ...state, stops: 0, tone: "", background: "none" }, center, { width, height }, this.gpu?.shown, 0), lit = [];
-    for (let i = 0; i < pixel.length; i += 4) if (pixel[i + 3] === 255 && pixel[i] + pixel[i + 1]) lit.push(pixel[i] + pixel[i + 1] / 255);
+    const height = 96;
+    const width = Math.max(1, Math.round((height * this.canvas.width) / this.canvas.height));
+    const pixel = this.pixels(
+      camera,
+      { ...state, stops: 0, tone: "", background: "none" },
+      center,
+      { width, height },
+      this.gpu?.shown,
+      0,
+    );
+    const lit = [];
+    for (let i = 0; i < pixel.length; i += 4)
+      if (pixel[i + 3] === 255 && pixel[i] + pixel[i + 1]) lit.push(pixel[i] + pixel[i + 1] / 255);
     const bright = lit.sort((x, y) => x - y)[Math.round(0.99 * (lit.length - 1))];
     return bright === undefined ? null : Math.log2(0.9) - ((bright - 127.5) * 2 * MOST_STOPS) / 255;
   }
-  close() { this.gl.getExtension("WEBGL_lose_context")?.loseContext(); }
+  close() {
+    this.gl.getExtension("WEBGL_lose_context")?.loseContext();
+  }
 }
 
 // A latitude-longitude picture of half floats, blurred over the sphere.
 function blurred({ data, width, height }) {
-  const rows = BLURRED, columns = 2 * rows, small = new Float32Array(3 * rows * columns), result = new Uint16Array(small.length), step = height / rows;
-  for (let y = 0; y < height; y++) for (let x = 0; x < width; x++) for (let c = 0; c < 3; c++) small[3 * (Math.floor(y / step) * columns + Math.floor(x / step)) + c] += half(data[3 * (y * width + x) + c]) / step ** 2;
-  const latitude = (row) => Math.PI * (0.5 - (row + 0.5) / rows), concentration = 1 / WIDE ** 2;
-  for (let y = 0; y < rows; y++) for (let x = 0; x < columns; x++) {
-    const sum = [0, 0, 0], up = latitude(y);
-    let total = 0;
-    for (let v = 0; v < rows; v++) for (let u = 0; u < columns; u++) {
-      const at = latitude(v), cosine = Math.sin(up) * Math.sin(at) + Math.cos(up) * Math.cos(at) * Math.cos((2 * Math.PI * (u - x)) / columns);
-      const weight = Math.cos(at) * Math.exp(concentration * (cosine - 1));
-      if (weight < 1e-3) continue;
-      total += weight;
-      for (let c = 0; c < 3; c++) sum[c] += weight * small[3 * (v * columns + u) + c];
+  const rows = BLURRED;
+  const columns = 2 * rows;
+  const small = new Float32Array(3 * rows * columns);
+  const result = new Uint16Array(small.length);
+  const step = height / rows;
+  for (let y = 0; y < height; y++)
+    for (let x = 0; x < width; x++)
+      for (let c = 0; c < 3; c++)
+        small[3 * (Math.floor(y / step) * columns + Math.floor(x / step)) + c] +=
+          half(data[3 * (y * width + x) + c]) / step ** 2;
+  const latitude = (row) => Math.PI * (0.5 - (row + 0.5) / rows);
+  const concentration = 1 / WIDE ** 2;
+  for (let y = 0; y < rows; y++)
+    for (let x = 0; x < columns; x++) {
+      const sum = [0, 0, 0];
+      const up = latitude(y);
+      let total = 0;
+      for (let v = 0; v < rows; v++)
+        for (let u = 0; u < columns; u++) {
+          const at = latitude(v);
+          const cosine =
+            Math.sin(up) * Math.sin(at) + Math.cos(up) * Math.cos(at) * Math.cos((2 * Math.PI * (u - x)) / columns);
+          const weight = Math.cos(at) * Math.exp(concentration * (cosine - 1));
+          if (weight < 1e-3) continue;
+          total += weight;
+          for (let c = 0; c < 3; c++) sum[c] += weight * small[3 * (v * columns + u) + c];
+        }
+      for (let c = 0; c < 3; c++) result[3 * (y * columns + x) + c] = toHalf(sum[c] / total);
     }
-    for (let c = 0; c < 3; c++) result[3 * (y * columns + x) + c] = toHalf(sum[c] / total);
-  }
   return result;
 }

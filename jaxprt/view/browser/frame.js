@@ -1,4 +1,5 @@
-// The frame around the picture: buttons, what is waited for, messages, the hint at the start, the help, and the dialog of pictures.
+// The frame around the picture: buttons, what is waited for, messages, the hint at the start, the help, and the
+// dialog of pictures.
 
 import { clamp, element } from "./common.js";
 import { HINT, HELP } from "./gestures.js";
@@ -21,7 +22,8 @@ const ICONS = {
 // The elements of a viewer in `shadow`. `on` has what its buttons do: `reset`, `undo`, and `save` with what is chosen.
 export function frameOf(shadow, on) {
   element("style", shadow, { textContent: STYLE });
-  const frame = element("div", shadow, { className: "frame" }), stage = element("div", frame, { className: "stage" });
+  const frame = element("div", shadow, { className: "frame" });
+  const stage = element("div", frame, { className: "stage" });
   const canvas = element("canvas", stage, { className: "canvas", tabIndex: 0 });
   canvas.setAttribute("role", "application");
   canvas.setAttribute("aria-label", "the scene; press H for the keys");
@@ -32,7 +34,10 @@ export function frameOf(shadow, on) {
   const told = element("div", words, { className: "told", hidden: true });
   const line = element("div", stage, { className: "line" });
   for (const each of [waiting, told]) each.setAttribute("role", "status");
-  const hint = element("div", stage, { className: "hint", innerHTML: matchMedia("(pointer: coarse)").matches ? HINT.touch : HINT.mouse });
+  const hint = element("div", stage, {
+    className: "hint",
+    innerHTML: matchMedia("(pointer: coarse)").matches ? HINT.touch : HINT.mouse,
+  });
   const tools = element("div", stage, { className: "tools" });
   const panel = element("div", frame, { className: "panel" });
   panel.setAttribute("role", "region");
@@ -45,8 +50,15 @@ export function frameOf(shadow, on) {
     node.setAttribute("aria-label", label);
     return node;
   };
-  const started = () => { hint.hidden = true; };
-  const toggleHelp = () => { help.hidden = !help.hidden; started(); if (help.hidden) canvas.focus(); else help.querySelector("button").focus(); };
+  const started = () => {
+    hint.hidden = true;
+  };
+  const toggleHelp = () => {
+    help.hidden = !help.hidden;
+    started();
+    if (help.hidden) canvas.focus();
+    else help.querySelector("button").focus();
+  };
   help.querySelector("button").onclick = toggleHelp;
   tool("picture", "save a picture, a video or the state", () => dialog.open());
   const [undo, redo] = [tool("undo", "undo (Z)", () => on.undo(-1)), tool("redo", "redo (Y)", () => on.undo(1))];
@@ -54,17 +66,31 @@ export function frameOf(shadow, on) {
   tool("theme", "dark or light", () => theme(!frame.classList.contains("light")));
   tool("help", "help (H)", toggleHelp);
   const unfold = tool("panel", "controls", () => fold(!frame.classList.contains("folded")));
-  const fold = (folded) => { frame.classList.toggle("folded", folded); unfold.setAttribute("aria-pressed", String(!folded)); };
+  const fold = (folded) => {
+    frame.classList.toggle("folded", folded);
+    unfold.setAttribute("aria-pressed", String(!folded));
+  };
   const theme = (light) => {
     frame.classList.toggle("light", light);
-    try { localStorage.setItem("jaxprt-theme", light ? "light" : "dark"); } catch { /* pages without storage forget it */ }
+    try {
+      localStorage.setItem("jaxprt-theme", light ? "light" : "dark");
+    } catch {
+      /* pages without storage forget it */
+    }
     frame.dispatchEvent(new Event("theme"));
   };
   const preferred = matchMedia("(prefers-color-scheme: light)");
   let stored = null;
-  try { stored = localStorage.getItem("jaxprt-theme"); } catch { /* likewise */ }
+  try {
+    stored = localStorage.getItem("jaxprt-theme");
+  } catch {
+    /* likewise */
+  }
   frame.classList.toggle("light", stored ? stored === "light" : preferred.matches);
-  preferred.addEventListener("change", (event) => { frame.classList.toggle("light", event.matches); frame.dispatchEvent(new Event("theme")); });
+  preferred.addEventListener("change", (event) => {
+    frame.classList.toggle("light", event.matches);
+    frame.dispatchEvent(new Event("theme"));
+  });
   fold(false);
   const watch = new ResizeObserver(() => {
     const narrow = frame.clientWidth <= NARROW;
@@ -75,22 +101,42 @@ export function frameOf(shadow, on) {
   watch.observe(frame);
   for (const kind of ["pointerdown", "wheel", "keydown"]) frame.addEventListener(kind, started);
   return {
-    frame, canvas, panel, line, help, toggleHelp, dialog,
-    unfold() { fold(false); },
+    frame,
+    canvas,
+    panel,
+    line,
+    help,
+    toggleHelp,
+    dialog,
+    unfold() {
+      fold(false);
+    },
     // Whether there is something to undo, and to redo.
-    steps(back, ahead) { [undo.disabled, redo.disabled] = [!back, !ahead]; },
-    tell(text) { told.textContent = text; told.hidden = !text; },
+    steps(back, ahead) {
+      [undo.disabled, redo.disabled] = [!back, !ahead];
+    },
+    tell(text) {
+      told.textContent = text;
+      told.hidden = !text;
+    },
     // What is waited for, and how far it is, from 0 to 1; null where nobody knows. No text: nothing is.
     busy(text, part = null) {
       bar.hidden = waiting.hidden = !text;
       bar.classList.toggle("open", part === null);
-      if (part === null) { bar.style.removeProperty("--part"); bar.removeAttribute("aria-valuenow"); }
-      else { bar.style.setProperty("--part", clamp(part, 0, 1)); bar.setAttribute("aria-valuenow", Math.round(100 * clamp(part, 0, 1))); }
+      if (part === null) {
+        bar.style.removeProperty("--part");
+        bar.removeAttribute("aria-valuenow");
+      } else {
+        bar.style.setProperty("--part", clamp(part, 0, 1));
+        bar.setAttribute("aria-valuenow", Math.round(100 * clamp(part, 0, 1)));
+      }
       bar.setAttribute("aria-label", text || "nothing is waited for");
       const shown = text && part !== null ? `${text}: ${Math.round(100 * clamp(part, 0, 1))} %` : text || "";
       if (waiting.textContent !== shown) waiting.textContent = shown;
     },
-    close() { watch.disconnect(); },
+    close() {
+      watch.disconnect();
+    },
   };
 }
 

@@ -7,7 +7,11 @@ const GLIDE = 130; // milliseconds in which a turn that was let go falls to a th
 const STOPPED = 60; // milliseconds without a move after which the hand had stopped
 const SLOWEST = 2e-5; // radians a millisecond
 
-const keys = (text) => text.split(" ").map((key) => `<kbd>${key}</kbd>`).join(" ");
+const keys = (text) =>
+  text
+    .split(" ")
+    .map((key) => `<kbd>${key}</kbd>`)
+    .join(" ");
 export const HINT = {
   mouse: `drag to orbit, wheel to zoom, ${keys("Shift")}-drag to turn the light, ${keys("H")} for all keys`,
   touch: "one finger orbits, two zoom and pan, a double tap looks at a point",
@@ -38,16 +42,32 @@ export const HELP = [
 export function gestures(canvas, frame, on) {
   const points = new Map();
   let pinch = null;
-  const place = (event) => { const box = canvas.getBoundingClientRect(); return [(2 * (event.clientX - box.left)) / box.width - 1, 1 - (2 * (event.clientY - box.top)) / box.height]; };
-  const aside = (event) => { const box = canvas.getBoundingClientRect(); return [(event.clientX - box.left - box.width / 2) / (box.height || 1), (event.clientY - box.top - box.height / 2) / (box.height || 1)]; };
+  const place = (event) => {
+    const box = canvas.getBoundingClientRect();
+    return [(2 * (event.clientX - box.left)) / box.width - 1, 1 - (2 * (event.clientY - box.top)) / box.height];
+  };
+  const aside = (event) => {
+    const box = canvas.getBoundingClientRect();
+    return [
+      (event.clientX - box.left - box.width / 2) / (box.height || 1),
+      (event.clientY - box.top - box.height / 2) / (box.height || 1),
+    ];
+  };
   // A turn of the camera goes on for a moment after the hand has let go, unless the system asks for less motion.
   let swing = null;
   const calm = matchMedia("(prefers-reduced-motion: reduce)");
-  const hold = () => { if (swing) cancelAnimationFrame(swing.frame); swing = null; };
+  const hold = () => {
+    if (swing) cancelAnimationFrame(swing.frame);
+    swing = null;
+  };
   const glide = (now) => {
-    const passed = now - swing.at, slower = Math.exp(-passed / GLIDE);
+    const passed = now - swing.at;
+    const slower = Math.exp(-passed / GLIDE);
     on.camera.orbit(swing.dx * passed, swing.dy * passed);
-    swing = Math.hypot(swing.dx, swing.dy) * slower > SLOWEST ? { dx: swing.dx * slower, dy: swing.dy * slower, at: now, frame: requestAnimationFrame(glide) } : null;
+    swing =
+      Math.hypot(swing.dx, swing.dy) * slower > SLOWEST
+        ? { dx: swing.dx * slower, dy: swing.dy * slower, at: now, frame: requestAnimationFrame(glide) }
+        : null;
     on.moved();
   };
   const release = (event) => {
@@ -58,7 +78,10 @@ export function gestures(canvas, frame, on) {
   };
   let speed = null; // of the camera, in radians a millisecond
   const spot = (event) => [event.clientX, event.clientY];
-  const middle = () => { const [a, b] = [...points.values()]; return { at: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], apart: Math.hypot(a[0] - b[0], a[1] - b[1]) || 1 }; };
+  const middle = () => {
+    const [a, b] = [...points.values()];
+    return { at: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], apart: Math.hypot(a[0] - b[0], a[1] - b[1]) || 1 };
+  };
   const listen = {
     contextmenu: (event) => event.preventDefault(),
     pointerdown(event) {
@@ -74,7 +97,9 @@ export function gestures(canvas, frame, on) {
     pointermove(event) {
       const from = points.get(event.pointerId);
       if (!from || !on.camera) return;
-      const to = spot(event), [dx, dy] = [to[0] - from[0], to[1] - from[1]], height = canvas.clientHeight || 1;
+      const to = spot(event);
+      const [dx, dy] = [to[0] - from[0], to[1] - from[1]];
+      const height = canvas.clientHeight || 1;
       points.set(event.pointerId, to);
       const before = speed;
       speed = null;
@@ -108,10 +133,22 @@ export function gestures(canvas, frame, on) {
   };
   // Letters act wherever nothing is typed; arrows, + and - on the picture alone.
   const typed = (event) => {
-    const from = event.composedPath()[0], elsewhere = from !== canvas;
+    const from = event.composedPath()[0];
+    const elsewhere = from !== canvas;
     const taken = event.key.toLowerCase() === "z" || event.key.toLowerCase() === "y"; // keys of undo, which other programs have with Ctrl
-    if (!on.camera || event.altKey || ((event.metaKey || event.ctrlKey) && !taken) || from.closest("dialog, input:not([type=range]), select")) return;
-    if (elsewhere && (event.key.length > 1 || "+-= ".includes(event.key)) && !(event.key === "Escape" && !on.help.hidden)) return;
+    if (
+      !on.camera ||
+      event.altKey ||
+      ((event.metaKey || event.ctrlKey) && !taken) ||
+      from.closest("dialog, input:not([type=range]), select")
+    )
+      return;
+    if (
+      elsewhere &&
+      (event.key.length > 1 || "+-= ".includes(event.key)) &&
+      !(event.key === "Escape" && !on.help.hidden)
+    )
+      return;
     hold();
     if (!key(event, on)) return;
     event.preventDefault();
@@ -120,9 +157,14 @@ export function gestures(canvas, frame, on) {
   for (const [name, each] of Object.entries(listen)) canvas.addEventListener(name, each, { passive: false });
   frame.addEventListener("keydown", typed);
   frame.addEventListener("dragover", (event) => event.preventDefault());
-  frame.addEventListener("drop", (event) => { event.preventDefault(); dropped(event.dataTransfer).then((files) => files.length && on.drop(files)); });
+  frame.addEventListener("drop", (event) => {
+    event.preventDefault();
+    dropped(event.dataTransfer).then((files) => files.length && on.drop(files));
+  });
   return {
-    get held() { return points.size > 0 || swing !== null; },
+    get held() {
+      return points.size > 0 || swing !== null;
+    },
     close() {
       hold();
       for (const [name, each] of Object.entries(listen)) canvas.removeEventListener(name, each);
@@ -133,12 +175,19 @@ export function gestures(canvas, frame, on) {
 
 // The files that were dropped, with those in folders, each with its place.
 async function dropped(data) {
-  const entries = [...data.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean), files = [...data.files].map((file) => ({ place: file.name, file }));
+  const entries = [...data.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
+  const files = [...data.files].map((file) => ({ place: file.name, file }));
   if (!entries.some((entry) => entry.isDirectory)) return files;
-  const found = [], walk = async (entry) => {
-    if (entry.isFile) return found.push({ place: entry.fullPath.slice(1), file: await new Promise((resolve, reject) => entry.file(resolve, reject)) });
+  const found = [];
+  const walk = async (entry) => {
+    if (entry.isFile)
+      return found.push({
+        place: entry.fullPath.slice(1),
+        file: await new Promise((resolve, reject) => entry.file(resolve, reject)),
+      });
     const reader = entry.createReader();
-    for (;;) { // browsers tell some at a time
+    for (;;) {
+      // browsers tell some at a time
       const some = await new Promise((resolve, reject) => reader.readEntries(resolve, reject));
       if (!some.length) return;
       for (const each of some) await walk(each);
@@ -149,23 +198,50 @@ async function dropped(data) {
 }
 
 function key(event, on) {
-  const { state } = on, scene = on.scene(), names = Object.keys(scene.systems);
+  const { state } = on;
+  const scene = on.scene();
+  const names = Object.keys(scene.systems);
   const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
   const next = names[(names.indexOf(state.system) + 1) % names.length];
-  if (arrow && event.shiftKey) { on.camera.pan(0.05 * arrow[0], 0.05 * arrow[1]); on.moved(); }
-  else if (arrow) { on.camera.orbit(0.1 * arrow[0], 0.1 * arrow[1]); on.moved(); }
-  else {
+  if (arrow && event.shiftKey) {
+    on.camera.pan(0.05 * arrow[0], 0.05 * arrow[1]);
+    on.moved();
+  } else if (arrow) {
+    on.camera.orbit(0.1 * arrow[0], 0.1 * arrow[1]);
+    on.moved();
+  } else {
     const act = {
-      "+": () => { on.camera.zoom(0.9); on.moved(); }, "=": () => { on.camera.zoom(0.9); on.moved(); },
-      "-": () => { on.camera.zoom(1 / 0.9); on.moved(); },
-      "[": () => on.set({ turn: state.turn - 0.1 }), "]": () => on.set({ turn: state.turn + 0.1 }),
-      ",": () => on.expose(state.stops - 0.5), ".": () => on.expose(state.stops + 0.5),
+      "+": () => {
+        on.camera.zoom(0.9);
+        on.moved();
+      },
+      "=": () => {
+        on.camera.zoom(0.9);
+        on.moved();
+      },
+      "-": () => {
+        on.camera.zoom(1 / 0.9);
+        on.moved();
+      },
+      "[": () => on.set({ turn: state.turn - 0.1 }),
+      "]": () => on.set({ turn: state.turn + 0.1 }),
+      ",": () => on.expose(state.stops - 0.5),
+      ".": () => on.expose(state.stops + 0.5),
       // What changes nothing leaves the picture at rest.
       l: () => scene.lights.length > 1 && on.set({ light: (state.light + 1) % scene.lights.length }),
       s: () => names.length > 1 && on.set({ system: next, bounces: state.bounces && scene.systems[next].bounces }),
-      b: () => scene.systems[state.system].bounces && on.set({ bounces: !state.bounces }), g: () => on.set({ background: BACKGROUNDS[(BACKGROUNDS.indexOf(state.background) + 1) % BACKGROUNDS.length] }),
-      p: () => on.set({ still: !state.still }), e: () => on.set({ exact: !state.exact }), z: () => on.undo(event.shiftKey ? 1 : -1), y: () => on.undo(1), f: () => on.frame(), c: () => state.lamps.length && on.set({ lamps: [] }), r: () => on.reset(),
-      a: () => on.automatic(true), h: () => on.toggleHelp(), escape: () => on.help.hidden || on.toggleHelp(),
+      b: () => scene.systems[state.system].bounces && on.set({ bounces: !state.bounces }),
+      g: () => on.set({ background: BACKGROUNDS[(BACKGROUNDS.indexOf(state.background) + 1) % BACKGROUNDS.length] }),
+      p: () => on.set({ still: !state.still }),
+      e: () => on.set({ exact: !state.exact }),
+      z: () => on.undo(event.shiftKey ? 1 : -1),
+      y: () => on.undo(1),
+      f: () => on.frame(),
+      c: () => state.lamps.length && on.set({ lamps: [] }),
+      r: () => on.reset(),
+      a: () => on.automatic(true),
+      h: () => on.toggleHelp(),
+      escape: () => on.help.hidden || on.toggleHelp(),
     }[event.key.toLowerCase()];
     if (!act) return false;
     act();

@@ -19,16 +19,27 @@ const row = (parent, text) => {
 };
 
 // A slider and a number that can be typed. The slider runs over places, which `at` makes values of and `of` finds again.
-function slider(parent, text, { low, high, step, at = (x) => x, of = (x) => x, digits, title = text, wrap = (x) => clamp(x, low, high) }, pick) {
+function slider(
+  parent,
+  text,
+  { low, high, step, at = (x) => x, of = (x) => x, digits, title = text, wrap = (x) => clamp(x, low, high) },
+  pick,
+) {
   const node = element("div", parent, { className: "row", title });
   element("span", node, { textContent: text });
-  const [from, to] = [of(low), of(high)].sort((a, b) => a - b), range = element("input", node, { type: "range", min: from, max: to, step: step ?? (to - from) / 200 });
+  const [from, to] = [of(low), of(high)].sort((a, b) => a - b);
+  const range = element("input", node, { type: "range", min: from, max: to, step: step ?? (to - from) / 200 });
   const number = element("input", node, { type: "number", step: 10 ** -digits });
   range.setAttribute("aria-label", text);
   number.setAttribute("aria-label", `${text}, typed`);
   range.oninput = () => pick(at(Number(range.value)));
-  number.onchange = () => { if (number.value !== "" && Number.isFinite(Number(number.value))) pick(wrap(Number(number.value))); node.show(node.value, !number.disabled); };
-  number.onkeydown = (event) => { if (event.key === "Enter") number.onchange(); };
+  number.onchange = () => {
+    if (number.value !== "" && Number.isFinite(Number(number.value))) pick(wrap(Number(number.value)));
+    node.show(node.value, !number.disabled);
+  };
+  number.onkeydown = (event) => {
+    if (event.key === "Enter") number.onchange();
+  };
   node.show = (value, acts = true) => {
     node.value = value;
     range.disabled = number.disabled = !acts;
@@ -45,7 +56,10 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
   const choice = (parent, text, names, pick) => {
     const node = element("select", row(parent, text));
     node.setAttribute("aria-label", text);
-    node.fill = (labels) => { node.textContent = ""; labels.forEach((name, i) => element("option", node, { textContent: name, value: i })); };
+    node.fill = (labels) => {
+      node.textContent = "";
+      labels.forEach((name, i) => element("option", node, { textContent: name, value: i }));
+    };
     node.fill(names);
     node.onchange = () => pick(Number(node.value));
     return node;
@@ -66,26 +80,65 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
   gallery.setAttribute("aria-label", "the scene in each light");
   const sides = { low: -180, high: 180, step: 1, digits: 1, wrap: (x) => ((((x + 180) % 360) + 360) % 360) - 180 };
   const turn = slider(lightPart, "rotation °", sides, (degrees) => set({ turn: degrees * DEGREE }));
-  const sky = element("canvas", lightPart, { className: "sky", width: 256, height: 128, tabIndex: 0, title: "the light as it is turned; the mark at its lower edge is where the camera looks" });
+  const sky = element("canvas", lightPart, {
+    className: "sky",
+    width: 256,
+    height: 128,
+    tabIndex: 0,
+    title: "the light as it is turned; the mark at its lower edge is where the camera looks",
+  });
   sky.setAttribute("role", "application");
-  sky.setAttribute("aria-label", "the light around the scene: a click or Enter puts a sun, a drag paints light, arrows move the place");
+  sky.setAttribute(
+    "aria-label",
+    "the light around the scene: a click or Enter puts a sun, a drag paints light, arrows move the place",
+  );
   element("div", lightPart, { className: "note", textContent: "Click to put a sun, drag to paint light." });
   const tint = element("input", row(lightPart, "sun color"), { type: "color", value: "#fff0d8" });
   const buttons = element("div", lightPart, { className: "row" });
-  const clear = element("button", buttons, { textContent: "remove suns", type: "button", className: "clear", onclick: () => set({ lamps: [] }) });
-  const file = element("input", lightPart, { type: "file", accept: ".hdr,.exr,.png,.jpg", multiple: true, hidden: true });
-  file.onchange = () => { if (file.files.length) open([...file.files]); file.value = ""; };
-  element("button", buttons, { textContent: "open a light…", type: "button", title: "an HDR or EXR file, which can be dropped on the picture, too", onclick: () => file.click() });
+  const clear = element("button", buttons, {
+    textContent: "remove suns",
+    type: "button",
+    className: "clear",
+    onclick: () => set({ lamps: [] }),
+  });
+  const file = element("input", lightPart, {
+    type: "file",
+    accept: ".hdr,.exr,.png,.jpg",
+    multiple: true,
+    hidden: true,
+  });
+  file.onchange = () => {
+    if (file.files.length) open([...file.files]);
+    file.value = "";
+  };
+  element("button", buttons, {
+    textContent: "open a light…",
+    type: "button",
+    title: "an HDR or EXR file, which can be dropped on the picture, too",
+    onclick: () => file.click(),
+  });
   const strip = stripOf(sky, tint, state, set);
 
   const viewPart = section(panel, "View");
   const names = Object.keys(scene.systems);
-  const system = names.length > 1 ? choice(viewPart, "system", names, (i) => set({ system: names[i], bounces: state.bounces && scene.systems[names[i]].bounces })) : null;
-  const exposure = slider(viewPart, "exposure", { low: -12, high: 12, step: 0.1, digits: 2, wrap: (x) => clamp(x, -20, 20) }, expose);
+  const system =
+    names.length > 1
+      ? choice(viewPart, "system", names, (i) =>
+          set({ system: names[i], bounces: state.bounces && scene.systems[names[i]].bounces }),
+        )
+      : null;
+  const exposure = slider(
+    viewPart,
+    "exposure",
+    { low: -12, high: 12, step: 0.1, digits: 2, wrap: (x) => clamp(x, -20, 20) },
+    expose,
+  );
   const auto = box(viewPart, "automatic exposure", "auto");
   auto[1].onchange = () => automatic(auto[1].checked);
   const tone = choice(viewPart, "tone curve", TONES, (i) => map(TONES[i]));
-  const wide = slider(viewPart, "view angle °", { low: 5, high: 120, step: 1, digits: 1 }, (degrees) => widen(degrees * DEGREE));
+  const wide = slider(viewPart, "view angle °", { low: 5, high: 120, step: 1, digits: 1 }, (degrees) =>
+    widen(degrees * DEGREE),
+  );
   const behind = choice(viewPart, "background", BACKGROUNDS, (i) => set({ background: BACKGROUNDS[i] }));
   const ground = element("input", row(viewPart, "its color"), { type: "color" });
   ground.oninput = () => set({ ground: [1, 3, 5].map((i) => parseInt(ground.value.slice(i, i + 2), 16) / 255) });
@@ -94,11 +147,16 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
   if (scene.rests.includes("exact")) boxes.push(box(viewPart, "exact picture at rest", "exact"));
   if (Object.values(scene.systems).some((each) => each.bounces)) boxes.push(box(viewPart, "bounces", "bounces"));
 
-  const free = scene.parts.filter((part) => part.free), parts = new Map();
-  const materialPart = free.length ? section(panel, free.length > MANY ? `Materials of ${free.length} parts` : "Materials") : null;
+  const free = scene.parts.filter((part) => part.free);
+  const parts = new Map();
+  const materialPart = free.length
+    ? section(panel, free.length > MANY ? `Materials of ${free.length} parts` : "Materials")
+    : null;
   if (free.length > FILTER) {
     const search = element("input", row(materialPart, "find a part"), { type: "text" });
-    search.oninput = () => { for (const [name, part] of parts) part.box.hidden = !name.toLowerCase().includes(search.value.toLowerCase()); };
+    search.oninput = () => {
+      for (const [name, part] of parts) part.box.hidden = !name.toLowerCase().includes(search.value.toLowerCase());
+    };
   }
   for (const part of free) {
     const opened = free.length <= MANY || (!parts.size && free.length <= FILTER);
@@ -115,7 +173,13 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
       wide.show(camera().angle / DEGREE);
       tone.value = TONES.indexOf(state.tone);
       behind.value = BACKGROUNDS.indexOf(state.background);
-      ground.value = "#" + state.ground.map((x) => Math.round(255 * x).toString(16).padStart(2, "0")).join("");
+      ground.value = `#${state.ground
+        .map((x) =>
+          Math.round(255 * x)
+            .toString(16)
+            .padStart(2, "0"),
+        )
+        .join("")}`;
       ground.parentElement.hidden = state.background !== "color";
       clear.disabled = !state.lamps.length;
       for (const [key, each] of boxes) each.checked = state[key];
@@ -125,12 +189,16 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
     // Shows a picture of the scene in a light, RGBA from below, in whose place a click puts the light.
     thumbnail(number, pixel, width, height) {
       while (gallery.children.length <= number) {
-        const at = gallery.children.length, name = scene.lights[at], button = element("button", gallery, { type: "button", title: name, onclick: () => set({ light: at }) });
+        const at = gallery.children.length;
+        const name = scene.lights[at];
+        const button = element("button", gallery, { type: "button", title: name, onclick: () => set({ light: at }) });
         button.setAttribute("aria-label", `light: ${name}`);
         element("canvas", button, { width, height });
       }
-      const context = gallery.children[number].firstChild.getContext("2d"), image = context.createImageData(width, height);
-      for (let y = 0; y < height; y++) image.data.set(pixel.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
+      const context = gallery.children[number].firstChild.getContext("2d");
+      const image = context.createImageData(width, height);
+      for (let y = 0; y < height; y++)
+        image.data.set(pixel.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
       context.putImageData(image, 0, 0);
       gallery.hidden = false;
       this.show();
@@ -151,12 +219,21 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
   };
 }
 
-// The picture of the environment as it is turned. A click puts a small bright lamp on it, a drag wide faint ones along its way.
+// The picture of the environment as it is turned. A click puts a small bright lamp on it, a drag wide faint ones
+// along its way.
 function stripOf(canvas, tint, state, set) {
-  const image = document.createElement("canvas"), width = () => canvas.width, place = { x: 0.5, y: 0.25 };
-  let source = null, drawn = "", azimuth = 0, keys = false;
-  const radiance = () => { // the picture of the unturned light, at the exposure of the moment
-    const { data, scale } = source, gain = scale * 2 ** state.stops, context = image.getContext("2d");
+  const image = document.createElement("canvas");
+  const width = () => canvas.width;
+  const place = { x: 0.5, y: 0.25 };
+  let source = null;
+  let drawn = "";
+  let azimuth = 0;
+  let keys = false;
+  const radiance = () => {
+    // the picture of the unturned light, at the exposure of the moment
+    const { data, scale } = source;
+    const gain = scale * 2 ** state.stops;
+    const context = image.getContext("2d");
     const pixel = context.createImageData(image.width, image.height);
     for (let i = 0; i < image.width * image.height; i++) {
       for (let c = 0; c < 3; c++) pixel.data[4 * i + c] = 255 * toDisplay(clamp(half(data[3 * i + c]) * gain, 0, 1));
@@ -168,13 +245,31 @@ function stripOf(canvas, tint, state, set) {
   const draw = () => {
     if (!source) return;
     if (drawn !== state.stops) radiance();
-    const context = canvas.getContext("2d"), w = width(), left = (((-state.turn / (2 * Math.PI)) % 1) + 1) % 1 * w;
+    const context = canvas.getContext("2d");
+    const w = width();
+    const left = ((((-state.turn / (2 * Math.PI)) % 1) + 1) % 1) * w;
     for (const x of [left - w, left]) context.drawImage(image, x, 0, w, canvas.height);
-    const x = (((0.5 - (azimuth + Math.PI) / (2 * Math.PI)) % 1) + 1) % 1 * w, y = canvas.height;
-    const mark = (at, color, size) => { context.fillStyle = color; context.beginPath(); context.moveTo(at - size, y); context.lineTo(at + size, y); context.lineTo(at, y - 1.6 * size); context.fill(); };
-    for (const at of [x - w, x, x + w]) for (const [color, size] of [["#000", 7], ["#fff", 5]]) mark(at, color, size);
+    const x = ((((0.5 - (azimuth + Math.PI) / (2 * Math.PI)) % 1) + 1) % 1) * w;
+    const y = canvas.height;
+    const mark = (at, color, size) => {
+      context.fillStyle = color;
+      context.beginPath();
+      context.moveTo(at - size, y);
+      context.lineTo(at + size, y);
+      context.lineTo(at, y - 1.6 * size);
+      context.fill();
+    };
+    for (const at of [x - w, x, x + w])
+      for (const [color, size] of [
+        ["#000", 7],
+        ["#fff", 5],
+      ])
+        mark(at, color, size);
     if (keys) {
-      for (const [color, size] of [["#000", 3], ["#fff", 1]]) {
+      for (const [color, size] of [
+        ["#000", 3],
+        ["#fff", 1],
+      ]) {
         context.strokeStyle = color;
         context.lineWidth = size;
         context.beginPath();
@@ -185,13 +280,26 @@ function stripOf(canvas, tint, state, set) {
   };
   // The direction, before the light is turned, of a place in the picture.
   const direction = (x, y) => {
-    const lon = Math.PI * (1 - 2 * x) - state.turn, lat = Math.PI * (0.5 - y);
+    const lon = Math.PI * (1 - 2 * x) - state.turn;
+    const lat = Math.PI * (0.5 - y);
     return [Math.cos(lat) * Math.sin(lon), Math.sin(lat), Math.cos(lat) * Math.cos(lon)];
   };
-  const at = (event) => { const box = canvas.getBoundingClientRect(); return direction((event.clientX - box.left) / box.width, clamp((event.clientY - box.top) / box.height, 0, 1)); };
-  const lamp = (way, angle, strength) => ({ direction: way, angle, radiance: unhex(tint.value).map((x) => x * strength) });
-  let last = null, painted = false;
-  canvas.onpointerdown = (event) => { canvas.setPointerCapture(event.pointerId); last = at(event); painted = false; };
+  const at = (event) => {
+    const box = canvas.getBoundingClientRect();
+    return direction((event.clientX - box.left) / box.width, clamp((event.clientY - box.top) / box.height, 0, 1));
+  };
+  const lamp = (way, angle, strength) => ({
+    direction: way,
+    angle,
+    radiance: unhex(tint.value).map((x) => x * strength),
+  });
+  let last = null;
+  let painted = false;
+  canvas.onpointerdown = (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    last = at(event);
+    painted = false;
+  };
   canvas.onpointermove = (event) => {
     if (!last || dot(last, at(event)) > Math.cos(0.12) || state.lamps.length >= 200) return;
     if (!painted) state.lamps = [...state.lamps, lamp(last, 0.15, 2)];
@@ -204,15 +312,23 @@ function stripOf(canvas, tint, state, set) {
   };
   canvas.onkeydown = (event) => {
     const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
-    if (step) { place.x = (place.x + step[0] / 64 + 1) % 1; place.y = clamp(place.y + step[1] / 32, 0, 1); }
-    else if (event.key === "Enter") set({ lamps: [...state.lamps, lamp(direction(place.x, place.y), 0.05, 300)] });
+    if (step) {
+      place.x = (place.x + step[0] / 64 + 1) % 1;
+      place.y = clamp(place.y + step[1] / 32, 0, 1);
+    } else if (event.key === "Enter") set({ lamps: [...state.lamps, lamp(direction(place.x, place.y), 0.05, 300)] });
     else return;
     event.preventDefault();
     event.stopPropagation();
     draw();
   };
-  canvas.onfocus = () => { keys = canvas.matches(":focus-visible"); draw(); };
-  canvas.onblur = () => { keys = false; draw(); };
+  canvas.onfocus = () => {
+    keys = canvas.matches(":focus-visible");
+    draw();
+  };
+  canvas.onblur = () => {
+    keys = false;
+    draw();
+  };
   return {
     show: draw,
     paint(data, { width: w, height: h, scale }) {
@@ -222,60 +338,114 @@ function stripOf(canvas, tint, state, set) {
       drawn = "";
       draw();
     },
-    look(angle) { if (angle !== azimuth) { azimuth = angle; draw(); } }, // where the camera stands
+    look(angle) {
+      if (angle !== azimuth) {
+        azimuth = angle;
+        draw();
+      }
+    }, // where the camera stands
   };
 }
 
 // The controls of one part: by their names in its model, and a plane where roughness and reflectance both act.
 function materialOf(parent, part, state, opened, moved) {
-  const { free } = part, value = (name) => state.materials[part.name]?.[name] ?? free[name];
+  const { free } = part;
+  const value = (name) => state.materials[part.name]?.[name] ?? free[name];
   const node = section(parent, part.name, opened, "part");
-  const change = (fields) => { state.materials = { ...state.materials, [part.name]: { ...state.materials[part.name], ...fields } }; show(); moved(); };
-  const blinn = free.exponent !== undefined, metallic = free.metallic !== undefined, shows = [];
+  const change = (fields) => {
+    state.materials = { ...state.materials, [part.name]: { ...state.materials[part.name], ...fields } };
+    show();
+    moved();
+  };
+  const blinn = free.exponent !== undefined;
+  const metallic = free.metallic !== undefined;
+  const shows = [];
   const reflects = () => !metallic || value("metallic") < 1; // of a metal the base color is the reflectance
   const color = (text, name, acts = () => true) => {
     if (!free[name]) return;
     const input = element("input", row(node, text), { type: "color" });
     input.oninput = () => change({ [name]: unhex(input.value) });
-    shows.push(() => { input.value = hex(value(name)); input.disabled = !acts(); });
+    shows.push(() => {
+      input.value = hex(value(name));
+      input.disabled = !acts();
+    });
   };
   const number = (text, name, options) => {
     if (free[name] === undefined) return;
     const control = slider(node, text, { digits: 3, ...options }, (x) => change({ [name]: x }));
     shows.push(() => control.show(value(name), options.acts?.() ?? true));
   };
-  const [low, high] = free.exponent_range ?? free.roughness_range ?? [0, 1], span = high / low;
+  const [low, high] = free.exponent_range ?? free.roughness_range ?? [0, 1];
+  const span = high / low;
   const power = { low, high, digits: 1, at: (x) => low * span ** x, of: (x) => Math.log(x / low) / Math.log(span) };
   color(metallic || !free.specular ? "base color" : "diffuse color", "diffuse");
   number("metallic", "metallic", { low: 0, high: 1 });
   if (free.roughness_range) number("roughness", "roughness", { low, high });
   if (blinn) number("exponent", "exponent", power);
-  number(blinn ? "specular" : "specular F0", "f0", { title: "reflectance at normal incidence of what is not metal", acts: reflects,  low: 0, high: 1, at: (x) => x * x, of: Math.sqrt });
+  number(blinn ? "specular" : "specular F0", "f0", {
+    title: "reflectance at normal incidence of what is not metal",
+    acts: reflects,
+    low: 0,
+    high: 1,
+    at: (x) => x * x,
+    of: Math.sqrt,
+  });
   color("specular tint", "specular", reflects);
   const across = blinn ? "exponent" : free.roughness_range ? "roughness" : null;
   // Of Blinn-Phong the exponent falls to the right, as roughness grows.
-  if (across && free.f0 !== undefined) shows.push(planeOf(node, { across, low, high, value, change, hidden: () => !reflects() }));
-  const reset = element("button", element("div", node, { className: "row" }), { type: "button", textContent: "as it was" });
-  reset.onclick = () => { const { [part.name]: _, ...others } = state.materials; state.materials = others; show(); moved(); };
-  shows.push(() => { reset.disabled = !state.materials[part.name]; });
-  const show = () => { if (node.open) for (const each of shows) each(); };
+  if (across && free.f0 !== undefined)
+    shows.push(planeOf(node, { across, low, high, value, change, hidden: () => !reflects() }));
+  const reset = element("button", element("div", node, { className: "row" }), {
+    type: "button",
+    textContent: "as it was",
+  });
+  reset.onclick = () => {
+    const { [part.name]: _, ...others } = state.materials;
+    state.materials = others;
+    show();
+    moved();
+  };
+  shows.push(() => {
+    reset.disabled = !state.materials[part.name];
+  });
+  const show = () => {
+    if (node.open) for (const each of shows) each();
+  };
   node.ontoggle = show;
   return { box: node, show };
 }
 
-// The plane of roughness and reflectance at normal incidence, whose square root goes up. It is drawn in the theme's colors.
+// The plane of roughness and reflectance at normal incidence, whose square root goes up. It is drawn in the theme's
+// colors.
 function planeOf(parent, { across, low, high, value, change, hidden }) {
-  const edge = 264, name = across === "exponent" ? "specular" : "F0", blinn = across === "exponent", margin = 12;
-  const canvas = element("canvas", parent, { className: "plane", width: edge, height: edge, tabIndex: 0, title: `${across} across, ${name} up` });
+  const edge = 264;
+  const name = across === "exponent" ? "specular" : "F0";
+  const blinn = across === "exponent";
+  const margin = 12;
+  const canvas = element("canvas", parent, {
+    className: "plane",
+    width: edge,
+    height: edge,
+    tabIndex: 0,
+    title: `${across} across, ${name} up`,
+  });
   canvas.setAttribute("role", "application");
   canvas.setAttribute("aria-label", `${across} across and ${name} up; arrows move the point`);
   const valueAt = (x) => (blinn ? low * (high / low) ** (1 - x) : low + x * (high - low));
   const placeOf = (v) => (blinn ? 1 - Math.log(v / low) / Math.log(high / low) : (v - low) / (high - low));
   const put = (x, y) => change({ [across]: valueAt(clamp(x, 0, 1)), f0: clamp(y, 0, 1) ** 2 });
   const inside = (share) => (share * edge - margin) / (edge - 2 * margin);
-  const drag = (event) => { const area = canvas.getBoundingClientRect(); put(inside((event.clientX - area.left) / area.width), 1 - inside((event.clientY - area.top) / area.height)); };
-  canvas.onpointerdown = (event) => { canvas.setPointerCapture(event.pointerId); drag(event); };
-  canvas.onpointermove = (event) => { if (canvas.hasPointerCapture(event.pointerId)) drag(event); };
+  const drag = (event) => {
+    const area = canvas.getBoundingClientRect();
+    put(inside((event.clientX - area.left) / area.width), 1 - inside((event.clientY - area.top) / area.height));
+  };
+  canvas.onpointerdown = (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    drag(event);
+  };
+  canvas.onpointermove = (event) => {
+    if (canvas.hasPointerCapture(event.pointerId)) drag(event);
+  };
   canvas.onkeydown = (event) => {
     const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
     if (!step) return;
@@ -285,15 +455,26 @@ function planeOf(parent, { across, low, high, value, change, hidden }) {
   };
   return () => {
     canvas.hidden = hidden();
-    const c = canvas.getContext("2d"), style = getComputedStyle(canvas), color = (key) => style.getPropertyValue(key);
-    const x = margin + (edge - 2 * margin) * clamp(placeOf(value(across)), 0, 1), y = edge - margin - (edge - 2 * margin) * Math.sqrt(clamp(value("f0"), 0, 1));
+    const c = canvas.getContext("2d");
+    const style = getComputedStyle(canvas);
+    const color = (key) => style.getPropertyValue(key);
+    const x = margin + (edge - 2 * margin) * clamp(placeOf(value(across)), 0, 1);
+    const y = edge - margin - (edge - 2 * margin) * Math.sqrt(clamp(value("f0"), 0, 1));
     c.fillStyle = color("--field");
     c.fillRect(0, 0, edge, edge);
     c.strokeStyle = color("--edge");
     c.lineWidth = 2;
     for (let k = 0; k <= 4; k++) {
       const at = margin + ((edge - 2 * margin) * k) / 4;
-      for (const [x0, y0, x1, y1] of [[at, margin, at, edge - margin], [margin, at, edge - margin, at]]) { c.beginPath(); c.moveTo(x0, y0); c.lineTo(x1, y1); c.stroke(); }
+      for (const [x0, y0, x1, y1] of [
+        [at, margin, at, edge - margin],
+        [margin, at, edge - margin, at],
+      ]) {
+        c.beginPath();
+        c.moveTo(x0, y0);
+        c.lineTo(x1, y1);
+        c.stroke();
+      }
     }
     c.fillStyle = color("--dim");
     c.font = "20px system-ui, sans-serif";

@@ -2,7 +2,7 @@
 // Translucent surfaces are shaded before it, layer by layer from the eye on, and each hides its share of what follows.
 
 import { clamp, floats } from "./common.js";
-import { AT, WHOLE, WIDTH } from "./shading.js";
+import { AT, WHOLE } from "./shading.js";
 
 const RASTER = `#version 300 es
 precision highp float; precision highp int; precision highp sampler2D; precision highp usampler2D;
@@ -79,16 +79,33 @@ const LAYERS = 4; // translucent surfaces that a pixel shows
 const STRIPS = 8; // of a picture with layers, at most
 
 const PIXEL_EDGES = [0, 8, 4, 2, 1]; // while something moves: colors at vertices, or edges of pixels
-const SLUGGISH = 45, BRISK = 22; // milliseconds of a frame from which on there are fewer pixels, and up to which more are tried
+const SLUGGISH = 45;
+const BRISK = 22; // milliseconds of a frame from which on there are fewer pixels, and up to which more are tried
 const PAUSE = 150; // milliseconds without a change until a picture at rest begins
 const PATIENCE = 3000; // milliseconds of a first picture at rest after which it is left to Python, where there is one
 // Where in a pixel samples lie, from its middle: the middle itself, and then eight on as many rows and columns.
-const JITTER = [[0, 0], [1, -3], [-1, 3], [5, 1], [-3, -5], [-5, 5], [-7, -1], [3, 7], [7, -7]].map((each) => each.map((x) => x / 16));
+const JITTER = [
+  [0, 0],
+  [1, -3],
+  [-1, 3],
+  [5, 1],
+  [-3, -5],
+  [-5, 5],
+  [-7, -1],
+  [3, 7],
+  [7, -7],
+].map((each) => each.map((x) => x / 16));
 
 export class Pixels {
-  constructor(gl, piece, backs) { // of faces after the first `backs` no backs are seen
-    Object.assign(this, { gl, piece, backs });
-    [this.level, this.least] = [1, 0]; // of PIXEL_EDGES
+  constructor(gl, piece, backs) {
+    // of faces after the first `backs` no backs are seen
+    this.gl = gl;
+    this.piece = piece;
+    this.backs = backs;
+    this.level = 1; // of PIXEL_EDGES
+    this.least = 0;
+    this.sample = this.row = 0; // of the picture at rest
+    this.patient = false; // whether slow frames are shown in any case
     this.trial = PIXEL_EDGES.map(() => ({ after: 0, pause: 2000 })); // when a finer level may be tried again
     this.quick = 0; // quick frames one after another
     this.strip = 1 << 14; // pixels at rest that are shaded in one call
@@ -102,7 +119,11 @@ export class Pixels {
     this.rest = piece.link(WHOLE, BARE);
     this.copy = piece.link(WHOLE, COPY);
     this.sharp = piece.link(RASTER, SHARP);
-    [this.unit, this.layerUnit, this.solidUnit, this.beforeUnit, this.stencilUnit] = [0, 0, 0, 0, 0].map(() => piece.unit++);
+    this.unit = piece.unit++;
+    this.layerUnit = piece.unit++;
+    this.solidUnit = piece.unit++;
+    this.beforeUnit = piece.unit++;
+    this.stencilUnit = piece.unit++;
     piece.ints(this.sharp, { image: 0, shown: this.unit, stencil: this.stencilUnit });
     gl.useProgram(this.raster);
     piece.ints(this.raster, { solid: this.solidUnit, before: this.beforeUnit, stencil: this.stencilUnit });
@@ -114,7 +135,8 @@ export class Pixels {
     this.shown = null; // the image that is seen; none while colors at vertices are
     this.stale = Boolean(this.message);
     this.boxes = piece.content.parts.map(({ first, count }) => {
-      const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+      const low = [Infinity, Infinity, Infinity];
+      const high = [-Infinity, -Infinity, -Infinity];
       for (let i = 3 * first; i < 3 * (first + count); i++) {
         low[i % 3] = Math.min(low[i % 3], piece.position[i]);
         high[i % 3] = Math.max(high[i % 3], piece.position[i]);
@@ -124,7 +146,10 @@ export class Pixels {
   }
   close() {
     const { gl, piece } = this;
-    for (const { handle, frame } of Object.values(this.images)) { gl.deleteTexture(handle); gl.deleteFramebuffer(frame); }
+    for (const { handle, frame } of Object.values(this.images)) {
+      gl.deleteTexture(handle);
+      gl.deleteFramebuffer(frame);
+    }
     this.release();
     this.forget();
     if (this.fence) gl.deleteSync(this.fence.sync);
@@ -140,7 +165,9 @@ export class Pixels {
     this.triangles = null;
   }
   // Whether frames take long even where they are coarsest.
-  get slow() { return !this.patient && this.level <= this.least && this.used.has(this.level) && this.stats.ms > 2 * SLUGGISH; }
+  get slow() {
+    return !this.patient && this.level <= this.least && this.used.has(this.level) && this.stats.ms > 2 * SLUGGISH;
+  }
   // The picture has changed: its light, view, materials or size.
   change(message) {
     this.message = message;
@@ -148,7 +175,9 @@ export class Pixels {
     this.stats.samples = 0;
   }
   // Whether the GPU is still at what it was given.
-  get busy() { return this.held || this.working; }
+  get busy() {
+    return this.held || this.working;
+  }
   get working() {
     const { gl, fence } = this;
     if (!fence) return false;
@@ -164,10 +193,17 @@ export class Pixels {
     gl.flush();
   }
   learn(ms, moving) {
-    if (!moving) { this.strip = clamp(ms < BRISK ? 2 * this.strip : ms > 2 * SLUGGISH ? this.strip / 2 : this.strip, 4096, 1 << 22); return; }
+    if (!moving) {
+      this.strip = clamp(ms < BRISK ? 2 * this.strip : ms > 2 * SLUGGISH ? this.strip / 2 : this.strip, 4096, 1 << 22);
+      return;
+    }
     this.stats.ms = ms;
-    if (!this.used.has(this.level)) { this.used.add(this.level); return; } // with the compiler's work
-    const now = performance.now(), finer = this.trial[this.level + 1];
+    if (!this.used.has(this.level)) {
+      this.used.add(this.level);
+      return;
+    } // with the compiler's work
+    const now = performance.now();
+    const finer = this.trial[this.level + 1];
     this.quick = ms < BRISK ? this.quick + 1 : 0;
     if (ms > SLUGGISH && this.level > this.least) {
       const { pause } = this.trial[this.level];
@@ -181,12 +217,13 @@ export class Pixels {
   // Gives the GPU the work of a frame. True if there is more to do.
   work(now, matrix, width, height, python) {
     this.fresh = false; // whether more is seen after it
-    this.least = this.floats && (this.piece.opacities.length || this.piece.count > (width * height) / PIXEL_EDGES[1] ** 2) ? 1 : 0; // vertices show no holes, and may be more than pixels
+    this.least =
+      this.floats && (this.piece.opacities.length || this.piece.count > (width * height) / PIXEL_EDGES[1] ** 2) ? 1 : 0; // vertices show no holes, and may be more than pixels
     this.level = this.floats ? Math.max(this.level, this.least) : 0;
     if (this.stale) {
       this.stale = false;
       this.since = now + PAUSE;
-      [this.sample, this.row] = [0, 0];
+      this.sample = this.row = 0;
       // At rest pixels become finer step by step.
       this.steps = this.sharpens ? PIXEL_EDGES.filter((each, level) => each > 1 && level > this.level) : [];
       this.move(matrix, width, height);
@@ -218,10 +255,12 @@ export class Pixels {
   // One strip of the picture at rest: of finer pixels, or of a sample, which counts as much as those before.
   refine(matrix, width, height) {
     this.piece.shine(this.message);
-    const step = this.steps[0] ?? 1, size = [width, height].map((x) => Math.ceil(x / step));
+    const step = this.steps[0] ?? 1;
+    const size = [width, height].map((x) => Math.ceil(x / step));
     const moved = step > 1 ? matrix : jittered(matrix, JITTER[this.sample], width, height);
     if (!this.row) this.find(moved, ...size, width, height);
-    const image = this.image(step > 1 ? `step ${step}` : "rest", ...size), rows = this.rows(this.row, ...size);
+    const image = this.image(step > 1 ? `step ${step}` : "rest", ...size);
+    const rows = this.rows(this.row, ...size);
     this.shade(image, moved, this.row, rows, step > 1 ? 1 : 1 / (this.sample + 1));
     this.row += rows;
     this.fresh = this.row >= size[1];
@@ -238,10 +277,20 @@ export class Pixels {
     const { gl, many } = this;
     if (many?.width === width && many.height === height) return many.frame;
     this.forget();
-    const frame = gl.createFramebuffer(), buffers = [[gl.RGBA16F, gl.COLOR_ATTACHMENT0], [gl.DEPTH_COMPONENT24, gl.DEPTH_ATTACHMENT]].map(([form, place]) => {
+    const frame = gl.createFramebuffer();
+    const buffers = [
+      [gl.RGBA16F, gl.COLOR_ATTACHMENT0],
+      [gl.DEPTH_COMPONENT24, gl.DEPTH_ATTACHMENT],
+    ].map(([form, place]) => {
       const handle = gl.createRenderbuffer();
       gl.bindRenderbuffer(gl.RENDERBUFFER, handle);
-      gl.renderbufferStorageMultisample(gl.RENDERBUFFER, Math.min(4, gl.getInternalformatParameter(gl.RENDERBUFFER, gl.RGBA16F, gl.SAMPLES)[0] ?? 0), form, width, height);
+      gl.renderbufferStorageMultisample(
+        gl.RENDERBUFFER,
+        Math.min(4, gl.getInternalformatParameter(gl.RENDERBUFFER, gl.RGBA16F, gl.SAMPLES)[0] ?? 0),
+        form,
+        width,
+        height,
+      );
       gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
       gl.framebufferRenderbuffer(gl.FRAMEBUFFER, place, gl.RENDERBUFFER, handle);
       return handle;
@@ -256,10 +305,14 @@ export class Pixels {
     this.many = null;
   }
   // Whether coarse pixels can be made fine along the edges of surfaces.
-  get sharpens() { return this.floats && !this.piece.blends; }
+  get sharpens() {
+    return this.floats && !this.piece.blends;
+  }
   // A picture of fine edges with the colors of coarse pixels, whose triangles have just been found.
   sharpened(coarse, matrix, step, width, height) {
-    const { gl, piece, sharp } = this, image = this.image("sharp", width, height), frame = this.multisampled(width, height);
+    const { gl, piece, sharp } = this;
+    const image = this.image("sharp", width, height);
+    const frame = this.multisampled(width, height);
     gl.useProgram(sharp);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, coarse.handle);
@@ -276,7 +329,11 @@ export class Pixels {
   }
   // Rows of the next strip. Each has layers of its own, whatever its height, so that with layers there are few.
   rows(row, width, height) {
-    return clamp(Math.floor(this.strip / width), this.piece.blends ? Math.min(Math.ceil(height / STRIPS), height - row) : 1, height - row);
+    return clamp(
+      Math.floor(this.strip / width),
+      this.piece.blends ? Math.min(Math.ceil(height / STRIPS), height - row) : 1,
+      height - row,
+    );
   }
   // A picture of a size of its own, as at rest. Frames wait for it. `dispose` is to be called once it has been read.
   async whole(matrix, width, height) {
@@ -288,7 +345,8 @@ export class Pixels {
         const moved = jittered(matrix, jitter, width, height);
         this.piece.shine(this.message);
         this.find(moved, width, height, width, height);
-        if (gl.getError() === gl.OUT_OF_MEMORY) throw new Error(`this browser's GPU has no memory for ${width} x ${height} pixels`);
+        if (gl.getError() === gl.OUT_OF_MEMORY)
+          throw new Error(`this browser's GPU has no memory for ${width} x ${height} pixels`);
         const image = this.image("saved", width, height);
         for (let row = 0, rows; row < height; row += rows) {
           rows = this.rows(row, width, height);
@@ -310,10 +368,15 @@ export class Pixels {
     delete this.images.saved;
   }
   image(name, width, height) {
-    const gl = this.gl, held = this.images[name];
+    const gl = this.gl;
+    const held = this.images[name];
     if (held?.width === width && held.height === height) return held;
-    if (held) { gl.deleteTexture(held.handle); gl.deleteFramebuffer(held.frame); }
-    const handle = gl.createTexture(), frame = gl.createFramebuffer();
+    if (held) {
+      gl.deleteTexture(held.handle);
+      gl.deleteFramebuffer(held.frame);
+    }
+    const handle = gl.createTexture();
+    const frame = gl.createFramebuffer();
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, handle);
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, width, height);
@@ -325,15 +388,18 @@ export class Pixels {
   }
   // Textures of triangles with depths of their own, of which one is drawn to while another one is read.
   targets(width, height, unit, depthUnits) {
-    const { gl } = this, texture = (form, to) => {
+    const { gl } = this;
+    const texture = (form, to) => {
       const handle = gl.createTexture();
       gl.activeTexture(gl.TEXTURE0 + to);
       gl.bindTexture(gl.TEXTURE_2D, handle);
       gl.texStorage2D(gl.TEXTURE_2D, 1, form, width, height);
-      for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
+      for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER])
+        gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
       return handle;
     };
-    const handle = texture(gl.RGBA32UI, unit), depths = depthUnits.map((to) => texture(gl.DEPTH_COMPONENT32F, to));
+    const handle = texture(gl.RGBA32UI, unit);
+    const depths = depthUnits.map((to) => texture(gl.DEPTH_COMPONENT32F, to));
     const frames = depths.map((depth) => {
       const frame = gl.createFramebuffer();
       gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
@@ -351,7 +417,9 @@ export class Pixels {
       if (this.piece.blends) sets.push(this.targets(width, height, this.layerUnit, [this.beforeUnit, this.beforeUnit]));
       this.triangles = { sets, width, height };
     }
-    const { gl } = this, [{ frames, depths }] = this.triangles.sets, bind = (texture) => {
+    const { gl } = this;
+    const [{ frames, depths }] = this.triangles.sets;
+    const bind = (texture) => {
       gl.activeTexture(gl.TEXTURE0 + this.solidUnit);
       gl.bindTexture(gl.TEXTURE_2D, texture);
     };
@@ -372,7 +440,7 @@ export class Pixels {
     gl.uniformMatrix4fv(piece.at("matrix", raster), false, matrix);
     drawSides(gl, this.backs, piece.face.length, (vertices) => {
       for (const { part, first, count } of piece.runs) {
-        if (first >= vertices || (part?.opacity.cutoff < 0) !== blending) continue;
+        if (first >= vertices || part?.opacity.cutoff < 0 !== blending) continue;
         piece.ints(raster, { holes: part ? 1 : 0, imaged: part?.stencil ? 1 : 0 });
         if (part) gl.uniform1f(piece.at("cutoff", raster), part.opacity.cutoff);
         if (part?.stencil) {
@@ -407,7 +475,9 @@ export class Pixels {
   }
   // Rows of translucent surfaces from the eye on, and of what is solid behind them, in an image of their own.
   layers({ width, height }, matrix, row, rows) {
-    const { gl } = this, image = this.image("layers", width, height), surfaces = (unit, blending) => {
+    const { gl } = this;
+    const image = this.image("layers", width, height);
+    const surfaces = (unit, blending) => {
       this.on(image, row, rows);
       gl.enable(gl.BLEND);
       gl.blendFunc(gl.ONE_MINUS_DST_ALPHA, gl.ONE);
@@ -432,7 +502,9 @@ export class Pixels {
   }
   // The next translucent surfaces from the eye on: behind the last ones, and before all that is solid.
   peel(layer, matrix, columns, rows) {
-    const { gl, piece } = this, { frames, depths } = this.triangles.sets[1], now = layer % 2;
+    const { gl, piece } = this;
+    const { frames, depths } = this.triangles.sets[1];
+    const now = layer % 2;
     gl.activeTexture(gl.TEXTURE0 + this.beforeUnit);
     gl.bindTexture(gl.TEXTURE_2D, depths[1 - now]);
     gl.useProgram(this.raster);
@@ -441,14 +513,15 @@ export class Pixels {
   }
   // Shades what `shown` has: backs and the sky first, then the solid parts or the translucent ones.
   surfaces({ width, height }, matrix, row, rows, shown, blending) {
-    const { gl, piece } = this, { pixel } = piece.programs;
+    const { gl, piece } = this;
+    const { pixel } = piece.programs;
     gl.useProgram(this.rest);
     gl.uniform1i(piece.at("shown", this.rest), shown);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.useProgram(pixel);
     gl.uniform1i(piece.at("shown", pixel), shown);
     piece.shade(pixel, this.message, (part) => {
-      if ((part.opacity?.cutoff < 0) !== blending) return;
+      if (part.opacity?.cutoff < 0 !== blending) return;
       const [left, low, right, high] = bounds(this.boxes[piece.content.parts.indexOf(part)], matrix, width, height);
       const [from, to] = [Math.max(low, row), Math.min(high, row + rows)];
       if (left >= right || from >= to) return;
@@ -458,7 +531,9 @@ export class Pixels {
   }
   // Colors and coverage of the picture at rest, from its lowest row.
   read() {
-    const { gl } = this, { frame, width, height } = this.images.rest, data = new Float32Array(4 * width * height);
+    const { gl } = this;
+    const { frame, width, height } = this.images.rest;
+    const data = new Float32Array(4 * width * height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, data);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -466,8 +541,8 @@ export class Pixels {
   }
 }
 
-// Draws faces with what is seen of their backs. Backs lie a little deeper: at silhouettes they are as deep as the fronts
-// beside them, and would show as dots.
+// Draws faces with what is seen of their backs. Backs lie a little deeper: at silhouettes they are as deep as the
+// fronts beside them, and would show as dots.
 export function drawSides(gl, backs, count, draw) {
   gl.enable(gl.DEPTH_TEST);
   gl.enable(gl.CULL_FACE);
@@ -485,7 +560,8 @@ export function drawSides(gl, backs, count, draw) {
 // The matrix of a camera whose pixels lie a little aside.
 function jittered(matrix, jitter, width, height) {
   const moved = Float32Array.from(matrix);
-  for (let j = 0; j < 4; j++) for (let c = 0; c < 2; c++) moved[4 * j + c] += ((2 * jitter[c]) / [width, height][c]) * matrix[4 * j + 3];
+  for (let j = 0; j < 4; j++)
+    for (let c = 0; c < 2; c++) moved[4 * j + c] += ((2 * jitter[c]) / [width, height][c]) * matrix[4 * j + 3];
   return moved;
 }
 
@@ -493,10 +569,12 @@ function jittered(matrix, jitter, width, height) {
 function bounds(box, matrix, width, height) {
   const result = [Infinity, Infinity, -Infinity, -Infinity];
   for (const corner of box) {
-    const [x, y, , w] = [0, 1, 2, 3].map((k) => matrix[k] * corner[0] + matrix[4 + k] * corner[1] + matrix[8 + k] * corner[2] + matrix[12 + k]);
+    const [x, y, , w] = [0, 1, 2, 3].map(
+      (k) => matrix[k] * corner[0] + matrix[4 + k] * corner[1] + matrix[8 + k] * corner[2] + matrix[12 + k],
+    );
     if (w <= 0) return [0, 0, width, height];
     [x, y].forEach((each, c) => {
-      const place = (each / w + 1) / 2 * [width, height][c];
+      const place = ((each / w + 1) / 2) * [width, height][c];
       result[c] = Math.min(result[c], place);
       result[2 + c] = Math.max(result[2 + c], place);
     });

@@ -6,6 +6,7 @@ const RATE = 30; // frames a second
 const BITS = 1.6e7; // a second of a video
 const VIDEOS = ["video/mp4;codecs=avc1.640028", "video/webm;codecs=vp9", "video/webm"]; // what browsers may write, the best first
 
+/** @type {Record<string, [string, { sized?: boolean, clear?: boolean, lasting?: boolean, python?: boolean }]>} */
 // What can be saved: its name, and whether it has a size, may have no background, lasts some seconds, and needs Python.
 const KINDS = {
   png: ["picture, PNG", { sized: true, clear: true }],
@@ -20,7 +21,8 @@ const KINDS = {
 // Asks what is to be saved, and how. `make` returns a file for a choice and says meanwhile how far it is; `python` says
 // whether there is one.
 export function dialogOf(parent, canvas, { make, python }) {
-  const dialog = element("dialog", parent), form = element("form", dialog, { method: "dialog" });
+  const dialog = element("dialog", parent);
+  const form = element("form", dialog, { method: "dialog" });
   dialog.setAttribute("aria-label", "save");
   element("h2", form, { textContent: "Save" });
   const field = (text, tag, fields) => {
@@ -28,50 +30,86 @@ export function dialogOf(parent, canvas, { make, python }) {
     element("span", row, { textContent: text });
     return element(tag, row, fields);
   };
-  const number = { type: "number", min: 1, max: 8192, step: 1, required: true }, kind = field("what", "select", {});
-  const width = field("width in pixels", "input", number), height = field("height in pixels", "input", number);
+  const number = { type: "number", min: 1, max: 8192, step: 1, required: true };
+  const kind = field("what", "select", {});
+  const width = field("width in pixels", "input", number);
+  const height = field("height in pixels", "input", number);
   const seconds = field("seconds", "input", { ...number, max: 60, value: 4 });
   const clear = field("transparent background", "input", { type: "checkbox" });
   const note = element("div", form, { className: "note" });
   note.setAttribute("role", "status");
-  const end = element("div", form, { className: "row end" }), cancel = element("button", end, { type: "button", textContent: "cancel" });
+  const end = element("div", form, { className: "row end" });
+  const cancel = element("button", end, { type: "button", textContent: "cancel" });
   const save = element("button", end, { type: "submit", className: "main", textContent: "save" });
-  const lock = (locked) => { for (const each of [kind, width, height, seconds, clear, save]) each.disabled = locked; };
+  const lock = (locked) => {
+    for (const each of [kind, width, height, seconds, clear, save]) each.disabled = locked;
+  };
   const show = () => {
     const [, { sized, clear: clears, lasting }] = KINDS[kind.value];
     for (const each of [width, height]) each.parentElement.hidden = each.disabled = !sized;
     clear.parentElement.hidden = !clears;
     seconds.parentElement.hidden = seconds.disabled = !lasting;
   };
-  let saved = null, stopped = null; // the choices of the last picture that was saved, and what ends a video
+  let saved = null;
+  let stopped = null; // the choices of the last picture that was saved, and what ends a video
   kind.onchange = show;
-  cancel.onclick = () => { stopped?.abort(); dialog.close(); };
+  cancel.onclick = () => {
+    stopped?.abort();
+    dialog.close();
+  };
   form.onsubmit = async (event) => {
     event.preventDefault();
-    const choice = { kind: kind.value, width: Number(width.value), height: Number(height.value), seconds: Number(seconds.value), transparent: clear.checked };
+    const choice = {
+      kind: kind.value,
+      width: Number(width.value),
+      height: Number(height.value),
+      seconds: Number(seconds.value),
+      transparent: clear.checked,
+    };
     stopped = new AbortController();
     lock(true);
     note.textContent = "it is being made";
     try {
-      const { blob, name } = await make(choice, (text) => { note.textContent = text; }, stopped.signal);
+      const { blob, name } = await make(
+        choice,
+        (text) => {
+          note.textContent = text;
+        },
+        stopped.signal,
+      );
       const link = element("a", form, { href: URL.createObjectURL(blob), download: name });
       link.click();
       link.remove();
       setTimeout(() => URL.revokeObjectURL(link.href), 60000);
       saved = choice;
       dialog.close();
-    } catch (error) { note.textContent = error.message; }
+    } catch (error) {
+      note.textContent = error.message;
+    }
     stopped = null;
     lock(false);
     show();
   };
   return {
     open() {
-      if (!stopped) { // else the dialog was left while its picture is being made
+      if (!stopped) {
+        // else the dialog was left while its picture is being made
         note.textContent = kind.textContent = "";
-        for (const [name, [text, { python: needs }]] of Object.entries(KINDS)) if (!needs || python()) element("option", kind, { value: name, textContent: text });
-        const { transparent, kind: last, seconds: length, ...size } = saved ?? { width: canvas.width, height: canvas.height, transparent: false, kind: "png", seconds: 4 };
-        [kind.value, width.value, height.value, seconds.value, clear.checked] = [last, size.width, size.height, length, transparent];
+        for (const [name, [text, { python: needs }]] of Object.entries(KINDS))
+          if (!needs || python()) element("option", kind, { value: name, textContent: text });
+        const {
+          transparent,
+          kind: last,
+          seconds: length,
+          ...size
+        } = saved ?? { width: canvas.width, height: canvas.height, transparent: false, kind: "png", seconds: 4 };
+        [kind.value, width.value, height.value, seconds.value, clear.checked] = [
+          last,
+          size.width,
+          size.height,
+          length,
+          transparent,
+        ];
         show();
       }
       dialog.showModal();
@@ -83,23 +121,31 @@ export function dialogOf(parent, canvas, { make, python }) {
 // A video of pictures. `picture` makes the one of a share of the whole, from 0 on. Browsers record what a canvas shows,
 // so that all pictures are made first and then shown at their times.
 export async function video(picture, { width, height, seconds }, told, signal) {
-  const type = VIDEOS.find((each) => window.MediaRecorder?.isTypeSupported(each)), frames = Math.round(seconds * RATE), pictures = [];
+  const type = VIDEOS.find((each) => window.MediaRecorder?.isTypeSupported(each));
+  const frames = Math.round(seconds * RATE);
+  const pictures = [];
   if (!type) throw new Error("this browser cannot record videos");
   for (let number = 0; number < frames; number++) {
     if (signal.aborted) throw new Error("the video was given up");
     told(`picture ${number + 1} of ${frames}`);
     pictures.push(await picture(number / frames));
   }
-  const canvas = Object.assign(document.createElement("canvas"), { width, height }), context = canvas.getContext("2d"), data = [];
+  const canvas = Object.assign(document.createElement("canvas"), { width, height });
+  const context = canvas.getContext("2d");
+  const data = [];
   const recorder = new MediaRecorder(canvas.captureStream(RATE), { mimeType: type, videoBitsPerSecond: BITS });
   recorder.ondataavailable = (event) => data.push(event.data);
-  const ended = new Promise((resolve, reject) => { recorder.onstop = resolve; recorder.onerror = () => reject(new Error("the browser could not record the video")); });
+  const ended = new Promise((resolve, reject) => {
+    recorder.onstop = resolve;
+    recorder.onerror = () => reject(new Error("the browser could not record the video"));
+  });
   told("recording");
   context.drawImage(await createImageBitmap(pictures[0]), 0, 0);
   recorder.start();
   const began = performance.now();
   for (let number = 0; number < frames; number++) {
-    const image = await createImageBitmap(pictures[number]), wait = began + (1000 * number) / RATE - performance.now();
+    const image = await createImageBitmap(pictures[number]);
+    const wait = began + (1000 * number) / RATE - performance.now();
     if (wait > 0) await new Promise((resolve) => setTimeout(resolve, wait));
     context.drawImage(image, 0, 0);
     image.close();
@@ -112,6 +158,11 @@ export async function video(picture, { width, height, seconds }, told, signal) {
 
 // The materials of all parts that can change, as they are now.
 export function materials(scene, changed) {
-  const free = scene.parts.filter((part) => part.free).map(({ name, free }) => [name, Object.fromEntries(Object.entries({ ...free, ...changed[name] }).filter(([key]) => !key.endsWith("_range")))]);
+  const free = scene.parts
+    .filter((part) => part.free)
+    .map(({ name, free }) => [
+      name,
+      Object.fromEntries(Object.entries({ ...free, ...changed[name] }).filter(([key]) => !key.endsWith("_range"))),
+    ]);
   return JSON.stringify({ jaxprt: "materials", materials: Object.fromEntries(free) }, null, 2);
 }

@@ -164,7 +164,8 @@ vec4 weightAt(int which) { // of a channel, with the logarithm of roughness, or 
   for (int k = 0; k < CORNERS; k++) result += share[k] * texelFetch(weights, at(weightStart + corner[k] * weightStep + which), 0);
   return result;
 }
-// Terms of MetallicRoughness, the lobe of BlinnPhong as the fifth, and those of CookTorrance with an F0 of 1 and of 0, in 1/sr: see jaxprt/brdf/microfacet.py and models.py.
+// Terms of MetallicRoughness, the lobe of BlinnPhong as the fifth, and those of CookTorrance with an F0 of 1 and of
+// 0, in 1/sr: see jaxprt/brdf/microfacet.py and models.py.
 vec4 family(vec3 wi, vec3 wo, vec3 normal, float rough) {
   vec3 h = normalize(wi + wo);
   float ci = dot(wi, normal), co = dot(wo, normal), z = dot(h, normal), schlick = pow(1. - min(dot(wo, h), 1.), 5.);
@@ -263,7 +264,8 @@ vec4 tangentAt(int vertex) { // of the texture's coordinates, with their handedn
   int code = int(abs(both)) - 1;
   return vec4(code % 255 - 127, code / 255 % 255 - 127, code / 65025 - 127, sign(both));
 }
-// The normal that a map has in the frame of the surface, and log roughness, wider by how far the normals of a pixel are apart: see jaxprt/scene/texture.py.
+// The normal that a map has in the frame of the surface, and log roughness, wider by how far the normals of a pixel
+// are apart: see jaxprt/scene/texture.py.
 void tilt(inout float rough) {
   vec4 tangent = vec4(0);
   for (int k = 0; k < CORNERS; k++) tangent += share[k] * tangentAt(first + corner[k]);

@@ -2,13 +2,33 @@
 
 const KEPT = 200; // states that can be taken back
 const SETTLED = 300; // milliseconds without a change after which a state is one of them
-const FIELDS = ["system", "turn", "lamps", "auto", "tone", "background", "ground", "bounces", "still", "exact", "materials"];
+const FIELDS = [
+  "system",
+  "turn",
+  "lamps",
+  "auto",
+  "tone",
+  "background",
+  "ground",
+  "bounces",
+  "still",
+  "exact",
+  "materials",
+];
 const DIGITS = 10;
 
 // A state as text: JSON. Places are those of the file, whose origin the scene has, and the light has its name.
 export function written(state, camera, scene, aspect) {
-  const { origin } = scene, world = (place) => place.map((x, i) => x + origin[i]);
-  const result = { jaxprt: "state", light: scene.lights[state.light], eye: world(camera.eye), target: world(camera.target), field_of_view: camera.angle, aspect };
+  const { origin } = scene;
+  const world = (place) => place.map((x, i) => x + origin[i]);
+  const result = {
+    jaxprt: "state",
+    light: scene.lights[state.light],
+    eye: world(camera.eye),
+    target: world(camera.target),
+    field_of_view: camera.angle,
+    aspect,
+  };
   for (const name of FIELDS) result[name] = state[name];
   if (!state.auto) result.stops = state.stops;
   return JSON.stringify(result, (_, value) => (typeof value === "number" ? Number(value.toPrecision(DIGITS)) : value));
@@ -16,18 +36,29 @@ export function written(state, camera, scene, aspect) {
 
 // Has a viewer show a state that was written. What the scene does not have is returned in words.
 export function restored(text, state, camera, scene) {
-  const { jaxprt, light, eye, target, field_of_view, ...fields } = JSON.parse(text), lacking = [];
+  const { jaxprt, light, eye, target, field_of_view, ...fields } = JSON.parse(text);
+  const lacking = [];
   if (jaxprt !== "state") throw new Error('a state must be JSON with "jaxprt": "state", as the viewer saves it');
   const local = (place, name) => {
-    if (!Array.isArray(place) || place.length !== 3 || !place.every(Number.isFinite)) throw new Error(`${name} of a state must be three numbers`);
+    if (!Array.isArray(place) || place.length !== 3 || !place.every(Number.isFinite))
+      throw new Error(`${name} of a state must be three numbers`);
     return place.map((x, i) => x - scene.origin[i]);
   };
   const places = [local(eye, "eye"), local(target, "target")];
-  if (!(field_of_view > 1e-3 && field_of_view < 3.14)) throw new Error("field_of_view of a state must be an angle in radians");
+  if (!(field_of_view > 1e-3 && field_of_view < 3.14))
+    throw new Error("field_of_view of a state must be an angle in radians");
   const kind = (value) => (Array.isArray(value) ? "list" : typeof value);
-  for (const name of FIELDS) if (name in fields && (fields[name] === null || kind(fields[name]) !== kind(state[name]))) throw new Error(`${name} of a state must be a ${kind(state[name])}`);
-  if (!Number.isFinite(fields.stops ?? 0) || !Number.isFinite(fields.turn ?? 0)) throw new Error("turn and stops of a state must be numbers");
-  for (const lamp of fields.lamps ?? []) if (![lamp.direction, lamp.radiance].every((three) => three?.length === 3 && three.every(Number.isFinite)) || !(lamp.angle > 0)) throw new Error("lamps of a state must have a direction, an angle and a radiance");
+  for (const name of FIELDS)
+    if (name in fields && (fields[name] === null || kind(fields[name]) !== kind(state[name])))
+      throw new Error(`${name} of a state must be a ${kind(state[name])}`);
+  if (!Number.isFinite(fields.stops ?? 0) || !Number.isFinite(fields.turn ?? 0))
+    throw new Error("turn and stops of a state must be numbers");
+  for (const lamp of fields.lamps ?? [])
+    if (
+      ![lamp.direction, lamp.radiance].every((three) => three?.length === 3 && three.every(Number.isFinite)) ||
+      !(lamp.angle > 0)
+    )
+      throw new Error("lamps of a state must have a direction, an angle and a radiance");
   camera.restore(...places, field_of_view);
   const number = scene.lights.indexOf(light);
   if (number < 0) lacking.push(`the light ${light}`);
@@ -39,17 +70,24 @@ export function restored(text, state, camera, scene) {
   }
   if (!scene.systems[state.system].bounces) state.bounces = false;
   const free = new Set(scene.parts.filter((part) => part.free).map((part) => part.name));
-  for (const name of Object.keys(state.materials)) if (!free.has(name)) {
-    lacking.push(`the part ${name}`);
-    delete state.materials[name];
-  }
+  for (const name of Object.keys(state.materials))
+    if (!free.has(name)) {
+      lacking.push(`the part ${name}`);
+      delete state.materials[name];
+    }
   return lacking.length ? `the scene lacks ${lacking.join(", ")} of the state` : "";
 }
 
 // States that can be taken back and done again. `take` writes the present one, or nothing while a hand is at it, `give`
 // shows one, and `told` hears of each that is kept.
 export class History {
-  constructor(take, give, told) { Object.assign(this, { take, give, told, states: [], at: -1, timer: 0 }); }
+  constructor(take, give, told) {
+    this.take = take;
+    this.give = give;
+    this.told = told;
+    this.timer = 0;
+    this.forget();
+  }
   changed() {
     clearTimeout(this.timer);
     this.timer = setTimeout(() => this.record(), SETTLED);
@@ -73,7 +111,14 @@ export class History {
     this.told((this.states[to] = this.take()));
   }
   // The present state is not another one, though it may have changed: a better scene has come.
-  amend() { if (this.at >= 0) this.states[this.at] = this.take() || this.states[this.at]; }
-  forget() { Object.assign(this, { states: [], at: -1 }); }
-  close() { clearTimeout(this.timer); }
+  amend() {
+    if (this.at >= 0) this.states[this.at] = this.take() || this.states[this.at];
+  }
+  forget() {
+    this.states = [];
+    this.at = -1;
+  }
+  close() {
+    clearTimeout(this.timer);
+  }
 }

@@ -26,16 +26,58 @@ export function mount(root, ask, { addressed = false } = {}) {
   const shadow = root.shadowRoot ?? root.attachShadow({ mode: "open" });
   shadow.textContent = "";
   root.dataset.lmSuppressShortcuts = "true"; // JupyterLab leaves the keys to the viewer
-  const view = frameOf(shadow, { reset: () => scene && reset(), undo: (by) => scene && past.step(by), save: { make: (...choice) => save(...choice), python: () => scene?.rests.includes("picture") } });
+  const view = frameOf(shadow, {
+    reset: () => scene && reset(),
+    undo: (by) => scene && past.step(by),
+    save: { make: (...choice) => save(...choice), python: () => scene?.rests.includes("picture") },
+  });
   const { frame, canvas, panel, line, help, tell, busy } = view;
-  const state = { system: "", light: 0, turn: 0, lamps: [], stops: 0, auto: true, tone: "srgb", background: "light", ground: [0.8, 0.8, 0.8], bounces: false, still: true, exact: false, materials: {} };
-  const stats = (canvas.stats = { sent: 0, got: 0, errors: 0, stills: 0, coarse: 0, draws: 0, sky: 0, bytes: 0, seq: 0, shown: -1, trip: 0 });
-  let scene = null, camera = null, drawing = null, closed = false;
+  const state = {
+    system: "",
+    light: 0,
+    turn: 0,
+    lamps: [],
+    stops: 0,
+    auto: true,
+    tone: "srgb",
+    background: "light",
+    ground: [0.8, 0.8, 0.8],
+    bounces: false,
+    still: true,
+    exact: false,
+    materials: {},
+  };
+  const stats = (canvas.stats = {
+    sent: 0,
+    got: 0,
+    errors: 0,
+    stills: 0,
+    coarse: 0,
+    draws: 0,
+    sky: 0,
+    bytes: 0,
+    seq: 0,
+    shown: -1,
+    trip: 0,
+  });
+  let scene = null;
+  let camera = null;
+  let drawing = null;
+  let closed = false;
   // Whether round trips are long: the kernel is far away, or the browser draws slowly. Then colors come as bytes, and
   // those that the eye can see first.
-  let long = false, bytes = null, partial = false;
+  let long = false;
+  let bytes = null;
+  let partial = false;
   let exposed = null; // the light that the exposure has been found for, while it is automatic
-  let seq = 0, flying = false, dirty = false, wanted = 0, stillTimer = 0, stillBusy = false, skyKey = {}, framed = 0;
+  let seq = 0;
+  let flying = false;
+  let dirty = false;
+  let wanted = 0;
+  let stillTimer = 0;
+  let stillBusy = false;
+  let skyKey = {};
+  let framed = 0;
   let unanswered = false; // whether the last picture at rest got no answer; it is asked for again
   let rest = { size: "", made: 0, ms: 0 }; // whole pictures at rest of one size: how many, and what the last one took
   const viewer = `${Date.now()}-${Math.random()}`; // its name, since each viewer of a session counts its own looks
@@ -50,22 +92,42 @@ export function mount(root, ask, { addressed = false } = {}) {
   };
   let refined = 0; // samples of the pixels that the status line tells
   let fresh = false; // whether more has changed than what pixels show
-  const again = () => { if (!wanted && !closed) wanted = requestAnimationFrame(draw); };
-  const redraw = () => { fresh = true; again(); };
+  const again = () => {
+    if (!wanted && !closed) wanted = requestAnimationFrame(draw);
+  };
+  const redraw = () => {
+    fresh = true;
+    again();
+  };
   const draw = (now) => {
     wanted = 0;
     if (!camera || closed || drawing.gl.isContextLost()) return;
     const appears = drawing.draw(camera, state, scene.center, now, state.still && scene.rests.length > 0, fresh);
     fresh = false;
-    if (drawing.gpu && gpu.stats.samples !== refined) { refined = gpu.stats.samples; describe(); }
+    if (drawing.gpu && gpu.stats.samples !== refined) {
+      refined = gpu.stats.samples;
+      describe();
+    }
     controls?.look(camera.azimuth);
     stats.draws++;
     if (appears) again();
   };
   const message = (kind) => ({
-    kind, viewer, seq, version: scene.version, system: state.system, light: state.light, turn: state.turn, lamps: state.lamps, eye: camera.eye,
-    target: camera.target, field_of_view: camera.angle, bounces: state.bounces, materials: state.materials,
-    stops: long ? state.stops : null, tone: state.tone,
+    kind,
+    viewer,
+    seq,
+    version: scene.version,
+    system: state.system,
+    light: state.light,
+    turn: state.turn,
+    lamps: state.lamps,
+    eye: camera.eye,
+    target: camera.target,
+    field_of_view: camera.angle,
+    bounces: state.bounces,
+    materials: state.materials,
+    stops: long ? state.stops : null,
+    tone: state.tone,
   });
   // Anything that changes the picture: the newest state is asked for as soon as the last answer has come.
   const moved = () => {
@@ -82,7 +144,9 @@ export function mount(root, ask, { addressed = false } = {}) {
   let looked = 0; // answers of Python
   let notice = ""; // what stays said until the next change
   // The GPU's scene: what it holds of a system, asked for once. Other states have their colors from Python.
-  let gpu = null, asked = "", lacking = "";
+  let gpu = null;
+  let asked = "";
+  let lacking = "";
   const page = async (from = scene) => {
     const system = state.system;
     if (asked === system) return;
@@ -97,17 +161,33 @@ export function mount(root, ask, { addressed = false } = {}) {
       gpu?.close();
       gpu = null;
       if (piece) gpu = new Pixels(drawing.gl, piece, 3 * (from.backs ?? from.face.length / 3));
-    } catch (error) { lacking = error.message; }
+    } catch (error) {
+      lacking = error.message;
+    }
     canvas.pixels = () => gpu;
     if (gpu && scene === from) moved();
   };
   // Whether the GPU shades the present state. A slow one leaves it to Python, if that is quicker.
-  const shades = () => gpu !== null && asked === state.system && gpu.piece.content.system === state.system && !state.bounces && !gpu.piece.fixed(state.materials) && !(gpu.slow && scene.rests.length && (looked < TRIES || stats.trip < 2 * gpu.stats.ms));
+  const shades = () =>
+    gpu !== null &&
+    asked === state.system &&
+    gpu.piece.content.system === state.system &&
+    !state.bounces &&
+    !gpu.piece.fixed(state.materials) &&
+    !(gpu.slow && scene.rests.length && (looked < TRIES || stats.trip < 2 * gpu.stats.ms));
   // Pages hold a row for each harmonic of reflected light, and the last one for lamps.
-  const lessLit = () => ["", ", lamps without highlights"][gpu.piece.content.reflectedUnit.length] ?? ", reflected light without highlights";
+  const lessLit = () =>
+    ["", ", lamps without highlights"][gpu.piece.content.reflectedUnit.length] ??
+    ", reflected light without highlights";
   const describe = () => {
     const { level, samples, ms } = gpu.stats;
-    const size = samples ? `pixels of ${samples} sample${samples > 1 ? "s" : ""}` : level ? (level === 1 ? "pixels" : `pixels of ${level} x ${level}`) : "vertices";
+    const size = samples
+      ? `pixels of ${samples} sample${samples > 1 ? "s" : ""}`
+      : level
+        ? level === 1
+          ? "pixels"
+          : `pixels of ${level} x ${level}`
+        : "vertices";
     line.textContent = `${size} by the browser's GPU${ms ? `, ${ms.toFixed(0)} ms` : ""}${lessLit()} · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}`;
   };
   const shade = () => {
@@ -128,10 +208,14 @@ export function mount(root, ask, { addressed = false } = {}) {
     page();
     drawing.gpu = shades() ? gpu : null;
     if (drawing.gpu) return shade();
-    if (flying) { dirty = true; return; }
+    if (flying) {
+      dirty = true;
+      return;
+    }
     if (closed) return;
     [flying, dirty] = [true, false];
-    const began = performance.now(), unexposed = state.auto && exposed !== state.light;
+    const began = performance.now();
+    const unexposed = state.auto && exposed !== state.light;
     const own = { ...message("look"), vertices: long && bytes && !unexposed ? vertices : "all" };
     if (unexposed) own.stops = null; // radiance, of which the exposure is found
     stats.sent++;
@@ -139,11 +223,16 @@ export function mount(root, ask, { addressed = false } = {}) {
       const { content, buffers } = await waiting.during("look", "waiting for colors from Python", ask(own));
       if (closed) return;
       if (content.kind === "late") return load(); // there is a better scene
-      if (content.kind === "error") { stats.errors++; tell(content.message); }
-      else {
-        const compressed = own.stops !== null, sent = buffers.reduce((total, each) => total + each.byteLength, 0);
+      if (content.kind === "error") {
+        stats.errors++;
+        tell(content.message);
+      } else {
+        const compressed = own.stops !== null;
+        const sent = buffers.reduce((total, each) => total + each.byteLength, 0);
         if (compressed) bytes = await inflate(buffers[0], scene.vertices, bytes, buffers[1]);
-        const data = compressed ? bytes : new Uint16Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 2);
+        const data = compressed
+          ? bytes
+          : new Uint16Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 2);
         partial = own.vertices === "seen";
         drawing.setColor(data, compressed, content.scale);
         if (unexposed && state.light === own.light) {
@@ -166,19 +255,35 @@ export function mount(root, ask, { addressed = false } = {}) {
     } catch (error) {
       stats.errors++;
       tell(`no answer from Python: ${error.message}`);
-      if (!closed) setTimeout(() => { dirty = false; look(); }, 1000);
+      if (!closed)
+        setTimeout(() => {
+          dirty = false;
+          look();
+        }, 1000);
     } finally {
       flying = false;
     }
     if (dirty) look();
     else if (stats.shown === seq && partial) look("unseen");
-    else if (stats.shown === seq) { sky(); stillTimer = setTimeout(rested, 250); }
+    else if (stats.shown === seq) {
+      sky();
+      stillTimer = setTimeout(rested, 250);
+    }
   };
-  const why = () => lacking || (state.bounces ? "reflected light" : gpu?.piece.fixed(state.materials) ? `the material of ${gpu.piece.fixed(state.materials)} is one of vertices` : gpu?.slow ? "the browser has no quick GPU" : "");
+  const why = () =>
+    lacking ||
+    (state.bounces
+      ? "reflected light"
+      : gpu?.piece.fixed(state.materials)
+        ? `the material of ${gpu.piece.fixed(state.materials)} is one of vertices`
+        : gpu?.slow
+          ? "the browser has no quick GPU"
+          : "");
   const status = (ms, rate, bytes) => {
     const number = (x) => x.toFixed(x < 10 ? 1 : 0);
-    line.textContent = `light ${number(ms.light)} ms · view ${number(ms.view)} ms · combine ${number(ms.combine)} ms · ` +
-      `there and back ${number(stats.trip)} ms · ${rate ? number(rate) + "/s · " : ""}${(bytes / 1024).toFixed(0)} kB · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}${why() ? ` · colors from Python: ${why()}` : ""}`;
+    line.textContent =
+      `light ${number(ms.light)} ms · view ${number(ms.view)} ms · combine ${number(ms.combine)} ms · ` +
+      `there and back ${number(stats.trip)} ms · ${rate ? `${number(rate)}/s · ` : ""}${(bytes / 1024).toFixed(0)} kB · ${scene.vertices.toLocaleString()} vertices${scene.note ? ` · ${scene.note}` : ""}${why() ? ` · colors from Python: ${why()}` : ""}`;
   };
   // The light as it is seen: a small picture at once and a fine one at rest, unless the way is long.
   const sky = async (rows = 1) => {
@@ -195,7 +300,9 @@ export function mount(root, ask, { addressed = false } = {}) {
       drawing.setSky(data, content);
       stats.sky = content.height;
       redraw();
-    } catch { skyKey = {}; }
+    } catch {
+      skyKey = {};
+    }
   };
   const rested = async () => {
     if (!long) sky(SKY_ROWS);
@@ -205,44 +312,81 @@ export function mount(root, ask, { addressed = false } = {}) {
   // Small pictures of the scene in each light, while nothing moves: of what was there when each was made.
   const small = new Map();
   const thumbnails = async () => {
-    const own = seq, { width, height } = SMALL;
+    const own = seq;
+    const { width, height } = SMALL;
     if (scene.lights.length < 2 || !scene.rests.length) return;
     for (let light = small.size; light < scene.lights.length && own === seq && !closed; light++) {
       try {
-        const { content, buffers } = await ask({ ...message("look"), light, turn: 0, lamps: [], stops: null, vertices: "all" });
+        const { content, buffers } = await ask({
+          ...message("look"),
+          light,
+          turn: 0,
+          lamps: [],
+          stops: null,
+          vertices: "all",
+        });
         if (closed || content.kind !== "color" || small.has(light)) return;
         const data = new Uint16Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 2);
         small.set(light, drawing.thumbnail(camera, state, scene.center, SMALL, [data, content.scale]));
         controls?.thumbnail(light, small.get(light), width, height);
         redraw();
-      } catch { return; }
+      } catch {
+        return;
+      }
     }
   };
-  // At rest: the picture at pixels, then the exact one. Where they take long a coarse one comes first. The first picture
-  // of a size does not count: its programs are compiled. Python gives up what it is at when the next look comes.
+  // At rest: the picture at pixels, then the exact one. Where they take long a coarse one comes first. The first
+  // picture of a size does not count: its programs are compiled. Python gives up what it is at when the next look
+  // comes.
   const still = async () => {
     if (!(state.still || state.exact) || !scene.rests.length || stillBusy || closed || flying) return;
     stillBusy = true;
-    const own = seq, size = { width: canvas.width, height: canvas.height }, name = `${size.width} ${size.height}`;
+    const own = seq;
+    const size = { width: canvas.width, height: canvas.height };
+    const name = `${size.width} ${size.height}`;
     if (rest.size !== name) rest = { size: name, made: 0, ms: 0 };
-    const steps = !state.still ? [] : rest.made > 1 && rest.ms > SLOW ? [["still", true], ["still", false]] : [["still", false]];
+    const steps = !state.still
+      ? []
+      : rest.made > 1 && rest.ms > SLOW
+        ? [
+            ["still", true],
+            ["still", false],
+          ]
+        : [["still", false]];
     if (state.exact) steps.push(["exact", true], ["exact", false]);
     try {
       for (const [kind, coarse] of steps) {
-        const asked = { ...message(kind), ...size, coarse, transparent: state.background !== "light" }, words = "computing the picture at pixels";
-        const { content, buffers } = await waiting.during("still", kind === "still" ? words : "computing the exact picture", ask(asked));
+        const asked = { ...message(kind), ...size, coarse, transparent: state.background !== "light" };
+        const words = "computing the picture at pixels";
+        const { content, buffers } = await waiting.during(
+          "still",
+          kind === "still" ? words : "computing the exact picture",
+          ask(asked),
+        );
         if (closed) break;
-        if (unanswered) { unanswered = false; tell(""); }
+        if (unanswered) {
+          unanswered = false;
+          tell("");
+        }
         if (own !== seq || content.kind === "late") break;
-        if (content.kind === "error") { tell(content.message); break; }
-        const compressed = asked.stops !== null, count = content.width * content.height;
-        const data = compressed ? await inflate(buffers[0], count) : new Uint16Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 2);
+        if (content.kind === "error") {
+          tell(content.message);
+          break;
+        }
+        const compressed = asked.stops !== null;
+        const count = content.width * content.height;
+        const data = compressed
+          ? await inflate(buffers[0], count)
+          : new Uint16Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 2);
         const cover = asked.transparent ? await decompressed(buffers[1]) : null;
         drawing.addStill(data, content.width, content.height, compressed, content.scale, cover);
         stats[coarse ? "coarse" : "stills"]++;
         if (kind === "still" && !coarse) rest = { size: name, made: rest.made + 1, ms: content.ms };
         if (kind === "exact" && !coarse) {
-          const error = content.error === undefined ? "" : `: the picture is ${(100 * content.error).toFixed(1)} ± ${(100 * content.spread).toFixed(1)} % off`;
+          const error =
+            content.error === undefined
+              ? ""
+              : `: the picture is ${(100 * content.error).toFixed(1)} ± ${(100 * content.spread).toFixed(1)} % off`;
           tell(`exact, direct light of the environment alone${error}`);
         }
         redraw();
@@ -253,10 +397,15 @@ export function mount(root, ask, { addressed = false } = {}) {
     } finally {
       stillBusy = false;
     }
-    if ((own !== seq || unanswered) && !closed && !flying && stats.shown === seq) stillTimer = setTimeout(still, unanswered ? 1000 : 250);
+    if ((own !== seq || unanswered) && !closed && !flying && stats.shown === seq)
+      stillTimer = setTimeout(still, unanswered ? 1000 : 250);
   };
 
-  const set = (fields) => { Object.assign(state, fields); controls?.show(); moved(); };
+  const set = (fields) => {
+    Object.assign(state, fields);
+    controls?.show();
+    moved();
+  };
   // The exposure for what is seen: at the start, when the light is another one, or when it is asked for.
   const found = (stops) => {
     if (stops !== null) state.stops = Math.round(10 * stops) / 10;
@@ -273,21 +422,30 @@ export function mount(root, ask, { addressed = false } = {}) {
     [state.auto, state.stops] = [false, clamp(stops, -20, 20)];
     controls?.show();
     past.changed();
-    if (long) moved(); else redraw();
+    if (long) moved();
+    else redraw();
   };
   const map = (tone) => {
     state.tone = tone;
     controls?.show();
     past.changed();
-    if (long) moved(); else redraw();
+    if (long) moved();
+    else redraw();
   };
-  const widen = (angle) => { camera.widen(angle); moved(); };
+  const widen = (angle) => {
+    camera.widen(angle);
+    moved();
+  };
   // Shows all of the part that was opened last, or of the scene.
   const frameAll = () => {
-    const low = [Infinity, Infinity, Infinity], high = low.map((x) => -x), count = scene.position.length / 3;
-    let first = 0, last = count;
+    const low = [Infinity, Infinity, Infinity];
+    const high = low.map((x) => -x);
+    const count = scene.position.length / 3;
+    let first = 0;
+    let last = count;
     if (opened) {
-      const number = scene.parts.findIndex((part) => part.name === opened), counts = scene.parts.map((part) => part.vertices);
+      const number = scene.parts.findIndex((part) => part.name === opened);
+      const counts = scene.parts.map((part) => part.vertices);
       first = counts.slice(0, number).reduce((total, each) => total + each, 0);
       last = first + (counts[number] ?? count);
     }
@@ -306,32 +464,58 @@ export function mount(root, ask, { addressed = false } = {}) {
     moved();
     tell((notice = lacking));
   };
-  const past = new History(() => !hands.held && written(state, camera, scene, canvas.width / canvas.height), give, (text) => {
-    view.steps(past.at > 0, past.at < past.states.length - 1);
-    if (addressed) history.replaceState(null, "", `#${encodeURIComponent(text)}`);
-  });
+  const past = new History(
+    () => !hands.held && written(state, camera, scene, canvas.width / canvas.height),
+    give,
+    (text) => {
+      view.steps(past.at > 0, past.at < past.states.length - 1);
+      if (addressed) history.replaceState(null, "", `#${encodeURIComponent(text)}`);
+    },
+  );
   const arrived = () => {
-    try { give(decodeURIComponent(location.hash.slice(1))); } catch (error) { tell(`the address holds no state: ${error.message}`); }
+    try {
+      give(decodeURIComponent(location.hash.slice(1)));
+    } catch (error) {
+      tell(`the address holds no state: ${error.message}`);
+    }
   };
   if (addressed) window.addEventListener("hashchange", arrived);
-  const took = ({ lights, light }, buffers) => { // texels of the last ones, from a number on
+  const took = ({ lights, light }, buffers) => {
+    // texels of the last ones, from a number on
     scene.lights = lights;
-    if (gpu) buffers.forEach((each, i) => { gpu.piece.lights[light + i] = new Float32Array(each.buffer, each.byteOffset, each.byteLength / 4); });
+    if (gpu)
+      buffers.forEach((each, i) => {
+        gpu.piece.lights[light + i] = new Float32Array(each.buffer, each.byteOffset, each.byteLength / 4);
+      });
   };
   const sent = async (kind, fields, files) => {
-    for (const file of files) if (file.size > 2 ** 29) throw new Error(`${file.name} must have at most 512 MiB, and has ${Math.ceil(file.size / 2 ** 20)}`);
+    for (const file of files)
+      if (file.size > 2 ** 29)
+        throw new Error(`${file.name} must have at most 512 MiB, and has ${Math.ceil(file.size / 2 ** 20)}`);
     const data = await Promise.all(files.map((file) => file.arrayBuffer()));
-    const { content, buffers } = await waiting.during("drop", `reading ${files.map((file) => file.name).join(", ")}`, ask({ kind, ...fields }, data).catch((error) => { throw new Error(`no answer from Python: ${error.message}`); }), 0);
+    const { content, buffers } = await waiting.during(
+      "drop",
+      `reading ${files.map((file) => file.name).join(", ")}`,
+      ask({ kind, ...fields }, data).catch((error) => {
+        throw new Error(`no answer from Python: ${error.message}`);
+      }),
+      0,
+    );
     if (content.kind === "error") throw new Error(content.message);
     return { content, buffers };
   };
   // Files that were dropped: a scene with all that belongs to it, or lights, or a state.
   const drop = async (files) => {
     try {
-      const opens = files.some(({ place }) => MESHES.test(place)), parts = files.filter(({ place }) => opens && !LIGHTS.test(place));
+      const opens = files.some(({ place }) => MESHES.test(place));
+      const parts = files.filter(({ place }) => opens && !LIGHTS.test(place));
       for (const { file } of files.filter((each) => !parts.includes(each))) {
         if (/\.json$/i.test(file.name)) {
-          try { give(await file.text()); } catch (error) { throw new Error(`${file.name}: ${error.message}`); }
+          try {
+            give(await file.text());
+          } catch (error) {
+            throw new Error(`${file.name}: ${error.message}`);
+          }
           continue;
         }
         const { content, buffers } = await sent("drop", { name: file.name }, [file]);
@@ -339,18 +523,27 @@ export function mount(root, ask, { addressed = false } = {}) {
         set({ light: content.light, lamps: [] });
       }
       if (!opens) return;
-      await sent("open", { names: parts.map(({ place }) => place) }, parts.map(({ file }) => file));
+      await sent(
+        "open",
+        { names: parts.map(({ place }) => place) },
+        parts.map(({ file }) => file),
+      );
       start();
     } catch (error) {
       stats.errors++;
       tell(error.message);
     }
   };
-  const reset = () => { camera = new Camera(scene); exposed = null; set({ turn: 0, lamps: [], materials: {}, auto: true }); };
+  const reset = () => {
+    camera = new Camera(scene);
+    exposed = null;
+    set({ turn: 0, lamps: [], materials: {}, auto: true });
+  };
   // What is seen at a place of the picture, from -1 to 1: the point, and the part that it belongs to.
   const seen = (x, y) => {
     const ray = camera.ray(canvas.clientWidth / canvas.clientHeight);
-    const way = unit([0, 1, 2].map((i) => ray[i] * x + ray[3 + i] * y + ray[6 + i])), origin = camera.eye;
+    const way = unit([0, 1, 2].map((i) => ray[i] * x + ray[3 + i] * y + ray[6 + i]));
+    const origin = camera.eye;
     const { distance, triangle } = meet(origin, way, scene.position, scene.face);
     if (triangle < 0) return null;
     let vertex = scene.face[3 * triangle];
@@ -376,19 +569,38 @@ export function mount(root, ask, { addressed = false } = {}) {
   // fields of the message and the state that are others for it.
   const picture = async ({ width, height, transparent, format = "png", samples }, from = { camera, fields: {} }) => {
     if (!scene) throw new Error("there is no scene yet");
-    const shows = { ...state, ...from.fields, background: transparent ? "none" : state.background }, python = scene.rests.includes("picture");
+    const shows = { ...state, ...from.fields, background: transparent ? "none" : state.background };
+    const python = scene.rests.includes("picture");
     if (!python) drawing.gpu?.change({ ...message("look"), ...from.fields, eye: from.camera.eye });
     if (!python) return drawn(await drawing.picture(from.camera, shows, scene.center, width, height), width, height);
     const over = !transparent && format === "png" && state.background !== "light";
-    const asked = { ...message("picture"), ...from.fields, eye: from.camera.eye, stops: state.stops, width, height, transparent: transparent || over, format, samples };
+    const asked = {
+      ...message("picture"),
+      ...from.fields,
+      eye: from.camera.eye,
+      stops: state.stops,
+      width,
+      height,
+      transparent: transparent || over,
+      format,
+      samples,
+    };
     const answer = await waiting.during("picture", `a picture of ${width} x ${height} pixels`, ask(asked), 0);
     if (answer.content.kind === "late") throw new Error("a better scene has come meanwhile: ask again");
     if (answer.content.kind === "error") throw new Error(answer.content.message);
     const blob = new Blob([answer.buffers[0]], { type: `image/${format}` });
-    return over ? drawn(drawing.backdrop(from.camera, shows, scene.center, width, height), width, height, await createImageBitmap(blob)) : blob;
+    return over
+      ? drawn(
+          drawing.backdrop(from.camera, shows, scene.center, width, height),
+          width,
+          height,
+          await createImageBitmap(blob),
+        )
+      : blob;
   };
   const save = async (choice, told, signal) => {
-    const { kind } = choice, json = (text) => new Blob([text], { type: "application/json" });
+    const { kind } = choice;
+    const json = (text) => new Blob([text], { type: "application/json" });
     if (!scene) throw new Error("there is no scene yet");
     if (kind === "state") return { blob: json(past.take()), name: "jaxprt.json" };
     if (kind === "materials") return { blob: json(materials(scene, state.materials)), name: "materials.json" };
@@ -413,7 +625,10 @@ export function mount(root, ask, { addressed = false } = {}) {
   };
   let controls = null;
   // What Python prepares: the page shows how far it is, and takes each better scene.
-  let unfollow = () => {}, loading = false, panelled = "", bouncing = false;
+  let unfollow = () => {};
+  let loading = false;
+  let panelled = "";
+  let bouncing = false;
   const start = () => {
     unfollow();
     resize();
@@ -437,10 +652,19 @@ export function mount(root, ask, { addressed = false } = {}) {
       const { content, buffers } = await ask({ kind: "lights", first: scene.lights.length });
       if (!closed && content.kind === "lights") took(content, buffers);
       controls?.show();
-    } catch { /* the next look tells */ }
+    } catch {
+      /* the next look tells */
+    }
   };
   // A light may have been dropped on another page of the same scene.
-  const returned = async () => { if (!closed) try { heard((await ask({ kind: "progress" })).content); } catch { /* the next look tells */ } };
+  const returned = async () => {
+    if (!closed)
+      try {
+        heard((await ask({ kind: "progress" })).content);
+      } catch {
+        /* the next look tells */
+      }
+  };
   frame.addEventListener("pointerenter", returned);
   const load = async () => {
     if (loading) return;
@@ -451,13 +675,24 @@ export function mount(root, ask, { addressed = false } = {}) {
       if (content.kind === "error") return tell(content.message);
       tell("");
       const array = (buffer, kind) => new kind(buffer.buffer, buffer.byteOffset, buffer.byteLength / 4);
-      const loaded = { ...content, buffers, position: array(buffers[0], Float32Array), face: array(buffers[1], Uint32Array) };
+      const loaded = {
+        ...content,
+        buffers,
+        position: array(buffers[0], Float32Array),
+        face: array(buffers[1], Uint32Array),
+      };
       if (!loaded.systems[state.system]) state.system = Object.keys(loaded.systems)[0];
       asked = "";
       await page(loaded); // before Python is asked for colors, whose programs may have to be compiled
       // Controls stay as they are where they show the same, because a hand may be at one.
-      const controlled = JSON.stringify([loaded.parts.map(({ name, free }) => [name, free]), loaded.lights, Object.keys(loaded.systems), loaded.rests]);
-      const had = scene?.systems[state.system]?.bounces, has = loaded.systems[state.system].bounces;
+      const controlled = JSON.stringify([
+        loaded.parts.map(({ name, free }) => [name, free]),
+        loaded.lights,
+        Object.keys(loaded.systems),
+        loaded.rests,
+      ]);
+      const had = scene?.systems[state.system]?.bounces;
+      const has = loaded.systems[state.system].bounces;
       // The GPU goes on with direct light until the programs of bounces are compiled.
       if (had !== has) [bouncing, state.bounces] = [has && gpu !== null && !loaded.finished, has];
       if (bouncing) state.bounces = false;
@@ -473,8 +708,18 @@ export function mount(root, ask, { addressed = false } = {}) {
       camera ??= new Camera(scene);
       drawing.setMesh(scene.position, scene.face, scene.backs);
       if (controlled !== panelled) {
-        controls = panelOf(panel, scene, state, { set, expose, automatic, map, moved, widen, camera: () => camera, open: (files) => drop(files.map((file) => ({ place: file.name, file }))) });
-        if (root.parentElement === document.body && document.activeElement === document.body) canvas.focus({ preventScroll: true }); // a page of the viewer alone: keys work at once
+        controls = panelOf(panel, scene, state, {
+          set,
+          expose,
+          automatic,
+          map,
+          moved,
+          widen,
+          camera: () => camera,
+          open: (files) => drop(files.map((file) => ({ place: file.name, file }))),
+        });
+        if (root.parentElement === document.body && document.activeElement === document.body)
+          canvas.focus({ preventScroll: true }); // a page of the viewer alone: keys work at once
         [panelled, skyKey] = [controlled, {}];
       }
       small.clear(); // of a scene with fewer shadows
@@ -490,11 +735,37 @@ export function mount(root, ask, { addressed = false } = {}) {
       loading = false;
     }
   };
-  try { drawing = new Drawing(canvas); } catch (error) { tell(error.message); return () => {}; }
+  try {
+    drawing = new Drawing(canvas);
+  } catch (error) {
+    tell(error.message);
+    return () => {};
+  }
   drawing.exposed = found;
-  const hands = gestures(canvas, frame, { get camera() { return camera; }, state, scene: () => scene, set, expose, automatic, moved, drop, reset, lookAt, pick, undo: (by) => past.step(by), frame: frameAll, help, toggleHelp: view.toggleHelp });
+  const hands = gestures(canvas, frame, {
+    get camera() {
+      return camera;
+    },
+    state,
+    scene: () => scene,
+    set,
+    expose,
+    automatic,
+    moved,
+    drop,
+    reset,
+    lookAt,
+    pick,
+    undo: (by) => past.step(by),
+    frame: frameAll,
+    help,
+    toggleHelp: view.toggleHelp,
+  });
   frame.addEventListener("theme", () => controls?.show());
-  canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); if (!closed) tell("the graphics context was lost; it comes back by itself"); });
+  canvas.addEventListener("webglcontextlost", (event) => {
+    event.preventDefault();
+    if (!closed) tell("the graphics context was lost; it comes back by itself");
+  });
   canvas.addEventListener("webglcontextrestored", () => {
     drawing.build();
     if (scene) drawing.setMesh(scene.position, scene.face, scene.backs);
@@ -506,18 +777,34 @@ export function mount(root, ask, { addressed = false } = {}) {
   canvas.state = state;
   canvas.camera = () => camera;
   start();
-  return () => { closed = true; unfollow(); past.close(); if (addressed) window.removeEventListener("hashchange", arrived); watch.disconnect(); view.close(); hands.close(); clearTimeout(stillTimer); drawing.close(); };
+  return () => {
+    closed = true;
+    unfollow();
+    past.close();
+    if (addressed) window.removeEventListener("hashchange", arrived);
+    watch.disconnect();
+    view.close();
+    hands.close();
+    clearTimeout(stillTimer);
+    drawing.close();
+  };
 }
 
 // Pixels that the graphics card has drawn as a PNG file, with an image over them.
 async function drawn({ pixel, parts }, width, height, over = null) {
-  const row = 4 * parts * width, canvas = Object.assign(document.createElement("canvas"), { width, height }), context = canvas.getContext("2d"), image = context.createImageData(width, height);
-  for (let y = 0, to = 0; y < height; y++) for (let x = 0; x < width; x++, to += 4) {
-    const low = parts * ((height - 1 - y) * row + 4 * x), sum = [0, 0, 0, 0]; // rows come from below
-    for (let i = 0; i < parts; i++) for (let j = 0; j < parts; j++) for (let c = 0; c < 4; c++) sum[c] += pixel[low + i * row + 4 * j + c];
-    for (let c = 0; c < 3; c++) image.data[to + c] = sum[3] && (255 * sum[c]) / sum[3];
-    image.data[to + 3] = sum[3] / parts ** 2;
-  }
+  const row = 4 * parts * width;
+  const canvas = Object.assign(document.createElement("canvas"), { width, height });
+  const context = canvas.getContext("2d");
+  const image = context.createImageData(width, height);
+  for (let y = 0, to = 0; y < height; y++)
+    for (let x = 0; x < width; x++, to += 4) {
+      const low = parts * ((height - 1 - y) * row + 4 * x);
+      const sum = [0, 0, 0, 0]; // rows come from below
+      for (let i = 0; i < parts; i++)
+        for (let j = 0; j < parts; j++) for (let c = 0; c < 4; c++) sum[c] += pixel[low + i * row + 4 * j + c];
+      for (let c = 0; c < 3; c++) image.data[to + c] = sum[3] && (255 * sum[c]) / sum[3];
+      image.data[to + 3] = sum[3] / parts ** 2;
+    }
   context.putImageData(image, 0, 0);
   if (over) context.drawImage(over, 0, 0);
   const file = await new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
@@ -528,7 +815,8 @@ async function drawn({ pixel, parts }, width, height, over = null) {
 // For anywidget: messages have numbers, by which answers find their questions.
 function render({ model, el }) {
   const waiting = new Map();
-  let last = 0, lost = false;
+  let last = 0;
+  let lost = false;
   const heard = (content, buffers) => {
     const each = waiting.get(content.id);
     if (!each) return;
@@ -549,11 +837,17 @@ function render({ model, el }) {
       if (lost) return reject(restarted());
       const id = `${Date.now()}-${Math.random()}-${++last}`;
       waiting.set(id, { resolve, reject });
-      setTimeout(() => { if (waiting.delete(id)) reject(new Error("the kernel was restarted, or is busy")); }, 120000);
+      setTimeout(() => {
+        if (waiting.delete(id)) reject(new Error("the kernel was restarted, or is busy"));
+      }, 120000);
       model.send({ id, content }, undefined, buffers);
     });
   el.style.height = `${model.get("height")}px`;
   const close = mount(el, ask);
-  return () => { model.off("msg:custom", heard); model.off("comm_live_update", cut); close(); };
+  return () => {
+    model.off("msg:custom", heard);
+    model.off("comm_live_update", cut);
+    close();
+  };
 }
 export default { render };
