@@ -1,6 +1,7 @@
 """Pages that show a scene without Python and relight it on the browser's GPU."""
 
 import base64
+import hashlib
 import html
 import os
 import pathlib
@@ -26,21 +27,27 @@ _SPARE_OF_SKIES = 4096  # bytes for what the page says of them
 _EFFORT = 9  # level of the compression of files that are written; sizes are tried with less
 _SPARE = 64  # bytes by which the page's size may change when another error is written into it
 _SMOOTHEST = 0.25  # least roughness that users of a page can choose: smoother materials vary over a bright texel
+# The page loads nothing, and runs its own script alone.
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; script-src 'sha256-{digest}'; \
+img-src data: blob:; base-uri 'none'; form-action 'none'">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{title}</title><link rel="icon" href="data:,">
-<body style="margin:0;height:100vh;background:#1a1a1a"><div id="viewer" style="height:100%"></div>
+<body><div id="viewer"></div>
 <script type="text/plain" id="data">{data}</script>
-<script type="module">
-import {{ answers, mount, unpack }} from "{module}";
-const text = document.getElementById("data");
-const packed = Uint8Array.from(atob(text.textContent), (each) => each.charCodeAt(0));
-text.remove();
-const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
-const {{ content, buffers }} = unpack(await new Response(stream).arrayBuffer());
-mount(document.getElementById("viewer"), answers(content, buffers), {{ addressed: true }});
-</script></body></html>
+<script type="module">{script}</script></body></html>
+"""
+_SCRIPT = """
+{
+  const text = document.getElementById("data");
+  const packed = Uint8Array.from(atob(text.textContent), (byte) => byte.charCodeAt(0));
+  text.remove();
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+  const { content, buffers } = unpack(await new Response(stream).arrayBuffer());
+  fillPage(document);
+  mount(document.getElementById("viewer"), answers(content, buffers), { addressed: true });
+}
 """
 
 
@@ -223,8 +230,9 @@ def _page(
         *(buffer for sky in skies if sky is not None for buffer in sky.buffers),
     ]
     data = base64.b64encode(zlib.compress(messages.pack(content, buffers), effort)).decode()
-    module = "data:text/javascript;base64," + base64.b64encode(browser.module().encode()).decode()
-    return _PAGE.format(title=html.escape(title), data=data, module=module).encode()
+    script = browser.module() + _SCRIPT
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    return _PAGE.format(title=html.escape(title), data=data, script=script, digest=digest).encode()
 
 
 def _skies(session: Session, room: int | float) -> list[Reply | None]:

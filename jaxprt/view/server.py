@@ -25,9 +25,9 @@ _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>jaxprt</title><link rel="icon" href="data:,">
-<body style="margin:0;height:100vh;background:#1a1a1a"><div id="viewer" style="height:100%"></div>
-<script type="module">
-import { mount, unpack } from "./viewer.js";
+<body><div id="viewer"></div><script type="module" src="./page.js"></script></body></html>
+"""
+_SCRIPT = """import { fillPage, mount, unpack } from "./viewer.js";
 async function ask(content, buffers = []) {
   const lengths = buffers.map((each) => each.byteLength);
   let head = new TextEncoder().encode(JSON.stringify({ content, lengths }));
@@ -40,9 +40,9 @@ async function ask(content, buffers = []) {
   if (!type.startsWith("application/octet-stream")) throw new Error((await response.text()) || response.status);
   return unpack(await response.arrayBuffer());
 }
+fillPage(document);
 const close = mount(document.getElementById("viewer"), ask, { addressed: true });
 window.addEventListener("pagehide", (event) => { if (!event.persisted) close(); });
-</script></body></html>
 """
 # The page loads nothing from other hosts, and no other page may embed or read it.
 _HEADERS = {
@@ -50,7 +50,8 @@ _HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
-    "Content-Security-Policy": "default-src 'self' 'unsafe-inline' data: blob:; frame-ancestors 'none'",
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; connect-src 'self'; img-src data: blob:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
 }
 
 
@@ -215,7 +216,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._refuse(400, "a request for a page must have no body")
             return
         pages = {"": (_PAGE.encode(), "text/html; charset=utf-8")}
-        pages["viewer.js"] = browser.module().encode(), "text/javascript; charset=utf-8"
+        for name, text in (("page.js", _SCRIPT), ("viewer.js", browser.module())):
+            pages[name] = text.encode(), "text/javascript; charset=utf-8"
         page = pages.get(place.split("?")[0])
         if page is None:
             self._refuse(404, "there is no such page")

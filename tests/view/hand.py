@@ -21,6 +21,7 @@ class Hand:
         self.page.set_default_timeout(180_000)  # two workers may take all cores; a picture at rest compiles for 40 s
         self.errors = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("console", lambda said: "Security Policy" in said.text and self.errors.append(said.text))
         self.page.goto(url)
         self.wait("shown >= 0 && stats.shown === stats.seq")
 

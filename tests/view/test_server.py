@@ -49,10 +49,11 @@ def request(server, path, *, method="GET", body=None, **headers):
 
 
 def test_the_page_and_its_module_are_served_and_nothing_is_fetched_from_elsewhere(echo):
-    for path, kind in (("", "text/html"), ("viewer.js", "text/javascript")):
+    for path, kind in (("", "text/html"), ("page.js", "text/javascript"), ("viewer.js", "text/javascript")):
         status, headers, data = request(echo, path)
         assert (status, headers["Content-Type"].split(";")[0]) == (200, kind)
-        assert "default-src 'self'" in headers["Content-Security-Policy"]
+        assert "default-src 'none'; script-src 'self'" in headers["Content-Security-Policy"]
+        assert "unsafe" not in headers["Content-Security-Policy"]
         assert b"http://" not in data
         assert b"https://" not in data
 
@@ -279,8 +280,11 @@ def test_the_page_and_its_messages_come_through_a_proxy(proxied):
     status, page = ask(made.url, method="GET", data=None)
     assert status == 200
     # Whatever the page loads is relative to it.
+    assert b'src="./page.js"' in page
+    status, script = ask(f"{made.url}page.js", method="GET", data=None)
+    assert status == 200
     for inner in (b'"./viewer.js"', b'"./ask"'):
-        assert inner in page
+        assert inner in script
     assert ask(f"{made.url}viewer.js", method="GET", data=None)[0] == 200
     origin = proxy.address.removesuffix(proxy.path)
     status, data = ask(f"{made.url}ask", Origin=origin)

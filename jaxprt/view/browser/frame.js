@@ -19,9 +19,21 @@ const ICONS = {
   panel: "M2 4.5h6m3 0h3M9.5 3v3M2 11.5h2m3 0h7M5.5 10v3",
 };
 
+// Has a document or a shadow tree look as a style says. Policies of pages forbid elements of style.
+function styled(root, text) {
+  const sheet = new CSSStyleSheet();
+  sheet.replaceSync(text);
+  root.adoptedStyleSheets = [sheet];
+}
+
+// Has the element of the viewer fill a page of its own.
+export function fillPage(page) {
+  styled(page, "body { margin: 0; height: 100vh; background: #1a1a1a; } #viewer { height: 100%; }");
+}
+
 // The elements of a viewer in `shadow`. `on` has what its buttons do: `reset`, `undo`, and `save` with what is chosen.
 export function frameOf(shadow, on) {
-  element("style", shadow, { textContent: STYLE });
+  styled(shadow, STYLE);
   const frame = element("div", shadow, { className: "frame" });
   const stage = element("div", frame, { className: "stage" });
   const canvas = element("canvas", stage, { className: "canvas", tabIndex: 0 });
