@@ -30,7 +30,9 @@ _STARTS = ("first", "weightStart", "pyramidStart", "visibleStart", "arrivedStart
 # Terms by which the page's module represents `ShininessFamily` and `SlopeFamily`.
 _TERMS = {standard.BLINN_PHONG: [3, 4], standard.COOK_TORRANCE: [3, 5, 6]}
 _LIGHT = 32  # most texels along the edge of the faces of the light that lobes read without visibility
-_IMAGE = 512  # most texels along an edge of an image
+FIRST_IMAGE = 10  # of the arrays of a page that hold images
+_EDGES = 2048, 1024, 512  # most texels along an edge of images
+_MOST_IMAGES = 1 << 27  # bytes of all images, above which they are smaller
 _STENCIL = 2048  # of the opacity of a surface, whose holes may be as fine as a texel
 _IMAGES = ("base_color", "roughness", "metallic", "emissive", "normal")  # textures that pages read at pixels
 _COLORED = ("base_color", "emissive")  # of these, those that are encoded by sRGB
@@ -73,7 +75,8 @@ def scene_content(page: PageScene) -> tuple[JsonObject, list[bytes]]:
     unit, visible_unit = unit_of([held.vector for held in page.parts]), unit_of([held.visible for held in page.parts])
     terms = max(-(-len(unit) // 4) * 4, 4)
     place: dict[str, int] = dict.fromkeys(_STARTS, 0)
-    tables, images, materials = _Tables(), _Images(), material_table.of_parts(page.scene.parts)
+    materials = material_table.of_parts(page.scene.parts)
+    tables, images = _Tables(), _Images(_edge_of_images(page.scene.parts))
     parts, scale = [], page.scales
     stride = 0 if scale is None else int(scale.total - scale.start[page.level])
     arrays: list[list[np.ndarray]] = [[] for _ in range(6)]
@@ -116,6 +119,7 @@ def scene_content(page: PageScene) -> tuple[JsonObject, list[bytes]]:
     tangent = np.asarray(materials.frame)[:count, 3:7] if mapped else np.zeros((0, 4))
     tangent = np.round(127 * np.clip(tangent, -1, 1)).astype("i1")
     clear = np.zeros((0, 3)) if opacity is None else np.column_stack([opacity.coordinate, opacity.factor])
+    assert len(joined) + 3 == FIRST_IMAGE
     joined += [coordinate.astype("<f4"), tangent.reshape(-1), clear.astype("<f4"), *images.data]
     content["images"] = images.described
     joined[2] = np.append(joined[2], np.zeros(4 - len(joined[2]) % 4, np.uint8))  # whole words
@@ -171,9 +175,12 @@ class _Tables:
 class _Images:
     """The images of a page's textures. Textures of one image share it."""
 
-    def __init__(self):
-        """Starts without images."""
-        self.described: list[dict[str, int]] = []  # size and number of channels of each image
+    def __init__(self, most: int):
+        """Starts without images, of which none will have more than so many texels along an edge."""
+        self._most = most
+        self.described: list[
+            dict[str, int]
+        ] = []  # size and number of channels of each image, and whether it is of colors
         self.data: list[np.ndarray] = []  # first row on top; colors are encoded by sRGB
         self._number: dict[tuple[int, str], int] = {}
 
@@ -183,12 +190,12 @@ class _Images:
         key = id(texture.image), "color" if colored else "normal" if normal else "value"
         if key not in self._number:
             value = unit_normals(texture.image) if normal else texture.image
-            value = np.clip(_halved(np.asarray(value), most=_IMAGE), 0, 1)
+            value = np.clip(_halved(np.asarray(value), most=self._most), 0, 1)
             if colored:
                 value = np.broadcast_to(value, (*value.shape[:2], 3))
                 value = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
             # Normals are 127 (normal + 1), so that their zeros and ones are exact.
-            self._append(key, (254 if normal else 255) * value)
+            self._append(key, (254 if normal else 255) * value, colored=colored)
         how = {"transform": np.asarray(texture.transform, float).tolist(), "set": texture.set, "wrap": texture.wrap}
         return {"image": self._number[key], **how}
 
@@ -204,11 +211,23 @@ class _Images:
             self._append(key, 255 * np.clip(_halved(image, most=_STENCIL), 0, 1))
         return about | {"image": self._number[key], "wrap": [WRAPS[number] for number in opacity.wrap[layer]]}
 
-    def _append(self, key: tuple[int, str], value: Float[np.ndarray, "h w c"]) -> None:
+    def _append(self, key: tuple[int, str], value: Float[np.ndarray, "h w c"], *, colored: bool = False) -> None:
         height, width, channels = value.shape
         self._number[key] = len(self.data)
-        self.described.append({"width": width, "height": height, "channels": channels})
+        self.described.append({"width": width, "height": height, "channels": channels, "colored": colored})
         self.data.append(np.round(value).astype(np.uint8))
+
+
+def _edge_of_images(parts: Sequence[Part]) -> int:
+    """Most texels along an edge, so that the images of all textures are not too many bytes."""
+    images = {}
+    for part in parts:
+        fields = vars(part.material).values() if isinstance(part.material, TexturedMaterial) else ()
+        images |= {id(field.image): field.image.shape for field in fields if isinstance(field, Texture)}
+    for edge in _EDGES:
+        if sum(min(h, edge) * min(w, edge) * 3 for h, w, *_ in images.values()) <= _MOST_IMAGES:
+            return edge
+    return _EDGES[-1]
 
 
 def _halved(value: Float[np.ndarray, "h w c"], *, most: int) -> Float[np.ndarray, "_ _ c"]:

@@ -1,14 +1,19 @@
 """Pages that show a scene without Python and relight it on the browser's GPU."""
 
 import base64
+import functools
 import hashlib
 import html
 import os
 import pathlib
+import tempfile
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
+
+import numpy as np
+import OpenImageIO
 
 from jaxprt import require
 from jaxprt.files import outputs
@@ -16,7 +21,7 @@ from jaxprt.files.inputs import JsonObject
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment
 from jaxprt.view import browser, messages, page_error
-from jaxprt.view.content import page_content
+from jaxprt.view.content import FIRST_IMAGE, page_content
 from jaxprt.view.messages import Reply
 from jaxprt.view.page_error import Cause
 from jaxprt.view.reduced import FIRST, PageScene
@@ -25,6 +30,9 @@ from jaxprt.view.session import Session
 _SKY_ROWS, _LEAST_SKY_ROWS = 1024, 128  # most rows of a picture of a light; at 128 texels are as good
 _SPARE_OF_SKIES = 4096  # bytes for what the page says of them
 _EFFORT = 9  # level of the compression of files that are written; sizes are tried with less
+_RAW = 128  # texels along an edge up to which images are no files
+_MOST_EXACT = 1 << 23  # bytes of exact files of images, above which those of colors are not exact
+_QUALITY = 92  # of files of colors, from 0 to 100
 _SPARE = 64  # bytes by which the page's size may change when another error is written into it
 _SMOOTHEST = 0.25  # least roughness that users of a page can choose: smoother materials vary over a bright texel
 # The page loads nothing, and runs its own script alone.
@@ -211,7 +219,7 @@ def _page(
 ) -> bytes:
     """The content of the HTML file. `effort` is the level of its compression, from 1 to 9."""
     reply = session.answer({"kind": "scene"})
-    content, arrays = contents
+    content, arrays = _with_image_files(*contents)
     free = [
         part | {"free": _free_parameters(part["free"]) if "material" in entry else None}
         for part, entry in zip(reply.content["parts"], content["parts"], strict=True)
@@ -233,6 +241,34 @@ def _page(
     script = browser.module() + _SCRIPT
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     return _PAGE.format(title=html.escape(title), data=data, script=script, digest=digest).encode()
+
+
+def _with_image_files(content: JsonObject, arrays: list[bytes]) -> tuple[JsonObject, list[bytes]]:
+    """The content and arrays of a page with files in place of large images: exact ones if they are not too large."""
+    described, held = content["images"], arrays[FIRST_IMAGE : FIRST_IMAGE + len(content["images"])]
+    large = [min(image["width"], image["height"]) > _RAW for image in described]
+    rows = list(zip(held, described, large, strict=True))
+    files = [_webp(data, *image.values(), exact=True) if flag else data for data, image, flag in rows]
+    if sum(map(len, files)) > _MOST_EXACT:
+        files = [_webp(data, *image.values(), exact=False) if flag else data for data, image, flag in rows]
+    described = [image | {"file": flag} for image, flag in zip(described, large, strict=True)]
+    return content | {"images": described}, [*arrays[:FIRST_IMAGE], *files, *arrays[FIRST_IMAGE + len(files) :]]
+
+
+@functools.lru_cache(maxsize=64)
+def _webp(data: bytes, width: int, height: int, channels: int, colored: bool, *, exact: bool) -> bytes:
+    """An image as a file for browsers. Other values than colors are kept as they are in any case."""
+    rows = np.broadcast_to(np.frombuffer(data, np.uint8).reshape(height, width, channels), (height, width, 3))
+    spec = OpenImageIO.ImageSpec(width, height, 3, "uint8")
+    spec.attribute("compression", f"webp:{_QUALITY}" if colored and not exact else "lossless")
+    with tempfile.TemporaryDirectory() as folder:
+        path = os.path.join(folder, "image.webp")
+        file = OpenImageIO.ImageOutput.create(path)
+        if file is None or not (
+            file.open(path, spec) and file.write_image(np.ascontiguousarray(rows)) and file.close()
+        ):
+            raise OSError(f"an image of {width} x {height} texels could not be written: {OpenImageIO.geterror()}")
+        return pathlib.Path(path).read_bytes()
 
 
 def _skies(session: Session, room: int | float) -> list[Reply | None]:

@@ -14,7 +14,7 @@ from jaxprt.brdf import BlinnPhong
 from jaxprt.compile import put
 from jaxprt.relit.groups import Layout
 from jaxprt.relit.scene import RelitScene
-from jaxprt.scene import Environment, Part, PointLight, Scene, TexturedMaterial, builtin
+from jaxprt.scene import Environment, Part, PointLight, Scene, Texture, TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
 from jaxprt.sphere import cubemap, harmonics
 from jaxprt.view import messages, stages
@@ -387,4 +387,25 @@ def test_matte_scenes_have_their_bounces_and_lamps_in_pages(browser, lit, lights
     assert off(page.color(look), true) < LOW
     turned = np.asarray(lit.radiance(rotate(soft["soft"], stages.about(np.pi / 2)), eye=eye))
     assert off(page.color(look | {"turn": np.pi / 2}), turned) < LOW
+    page.page.close()
+
+
+@pytest.mark.parametrize(("most", "bound"), [(1 << 23, DISK), (0, 0.015)])
+def test_images_of_a_page_are_files_which_are_exact_if_small(browser, lights, look, tmp_path, monkeypatch, most, bound):
+    monkeypatch.setattr("jaxprt.view.piece._MOST_EXACT", most)
+    place = np.linspace(0, 2 * np.pi, 192, endpoint=False)
+    color = 0.5 + 0.3 * np.sin(place[:, None, None] + place[None, :, None] * [1.0, 2.0, 3.0])
+    rough = 0.6 + 0.3 * np.random.default_rng(2).uniform(-1, 1, (160, 160, 1))
+    material = TexturedMaterial(base_color_texture=Texture(color), roughness_texture=Texture(rough), metallic=0.0)
+    sphere = builtin.sphere(rings=12, sectors=24)
+    sphere = dataclasses.replace(sphere, texture=np.asarray(sphere.position)[:, :2] * 0.4 + 0.5)
+    scene = prt.Scene([Part("ball", sphere, material)])
+    made = prt.precompute(scene, refine=False, system=prt.relit.Lobes(8, texels=2), size=8, progress=False)
+    piece = view.export(made, tmp_path / "page.html", environments=lights)
+    page = Page(browser, piece.path)
+    names = page.page.evaluate(
+        "async () => (await window.ask({ kind: 'page' })).content.images.map((image) => image.file)"
+    )
+    assert names == [True, True]
+    assert off(page.color(look), reduced_radiance(made, lights, look, texels=True)) < bound
     page.page.close()

@@ -18,7 +18,7 @@ export class Piece {
     // positions and faces come first
     this.content = content;
     this.buffers = buffers;
-    this.blur = this.expanding = null;
+    this.blur = this.expanding = this.decoding = null;
     const next = (() => {
       let i = 0;
       return (kind) => {
@@ -46,8 +46,18 @@ export class Piece {
     this.runs = runs(content.parts, this.face, this.count);
     this.blends = content.parts.some((part) => part.opacity?.cutoff < 0);
   }
+  // Images that came as files.
+  async decode() {
+    const { images } = this.content;
+    await Promise.all(
+      images.map(async (image, i) => {
+        if (image.file) this.images[i] = await decoded(this.images[i], image);
+      }),
+    );
+  }
   // Means of visibility, where only bits were sent: to await before `build`.
   async expand() {
+    await (this.decoding ??= this.decode());
     const { content } = this;
     if (content.means > this.pyramid.length)
       this.pyramid = await (this.expanding ??= means(content, this.bits, this.index));
@@ -610,6 +620,17 @@ export class Piece {
     });
     part.written = key;
   }
+}
+
+// The texels of an image from its file, as bytes of so many channels.
+async function decoded(file, { width, height, channels }) {
+  const bitmap = await createImageBitmap(new Blob([file]), { premultiplyAlpha: "none", colorSpaceConversion: "none" });
+  const context = new OffscreenCanvas(width, height).getContext("2d");
+  context.drawImage(bitmap, 0, 0);
+  const { data } = context.getImageData(0, 0, width, height);
+  const result = new Uint8Array(width * height * channels);
+  for (let i = 0, to = 0; i < data.length; i += 4) for (let c = 0; c < channels; c++) result[to++] = data[i + c];
+  return result;
 }
 
 // Runs of corners of faces: of a part with holes or of translucent material, or of any others.
