@@ -22,7 +22,7 @@ from jaxprt.scene.scene import centered
 from jaxprt.scene.sides import two_sided
 
 _LINE = 28  # pixels below each picture for the name of its light
-_TEXT = 16  # pixels of its letters
+_TEXT, _SMALLEST = 16, 9  # pixels of its letters
 
 
 @options.command(
@@ -81,7 +81,9 @@ def command(chosen: SimpleNamespace) -> options.Result:
         shown[name] = np.asarray(image.display(picture, tone=chosen.tone, stops=relit.exposure(picture, camera)))
     columns = min(chosen.columns or math.ceil(math.sqrt(len(shown))), len(shown))
     files.write_png(path, sheet(shown, columns=columns))
-    return options.Result({"lights": list(shown), "sheet": path}, f"{len(shown)} lights are in {path}")
+    return options.Result(
+        {"lights": list(shown), "sheet": path}, f"{path} shows {len(shown)} light{'s' * (len(shown) > 1)}"
+    )
 
 
 def _lights(chosen: SimpleNamespace) -> Iterator[tuple[str, Environment]]:
@@ -107,11 +109,24 @@ def sheet(pictures: dict[str, Float[np.ndarray, "h w 3"]], *, columns: int) -> F
     return result
 
 
+def _fitting(text: str, width: int) -> tuple[str, int]:
+    """A text and the height of its letters: smaller, and then without its middle, where it is too wide."""
+    for height in range(_TEXT, _SMALLEST - 1, -1):
+        if OpenImageIO.ImageBufAlgo.text_size(text, height).width <= width:
+            return text, height
+    for kept in range(len(text) - 2, 1, -1):
+        short = f"{text[: (kept + 1) // 2]}…{text[-(kept // 2) :]}"
+        if OpenImageIO.ImageBufAlgo.text_size(short, _SMALLEST).width <= width:
+            return short, _SMALLEST
+    return "", _SMALLEST
+
+
 def _text(text: str, width: int) -> Float[np.ndarray, "h w 3"]:
-    """A line of black text on white, cut off where it does not fit."""
+    """A line of black text on white."""
+    shown, height = _fitting(text, width - 4)
     line = OpenImageIO.ImageBuf(OpenImageIO.ImageSpec(width, _LINE, 3, "float"))
     OpenImageIO.ImageBufAlgo.fill(line, (1.0, 1.0, 1.0))
     place = {"alignx": "center", "aligny": "center", "textcolor": (0.0, 0.0, 0.0)}
-    if not OpenImageIO.ImageBufAlgo.render_text(line, width // 2, _LINE // 2, text, _TEXT, **place):
+    if not OpenImageIO.ImageBufAlgo.render_text(line, width // 2, _LINE // 2, shown, height, **place):
         raise OSError(f"the name {text!r} could not be drawn: {line.geterror()}")
     return np.asarray(line.get_pixels(OpenImageIO.FLOAT))

@@ -8,6 +8,9 @@ from jaxprt.files.inputs import JsonObject
 COMPILING = "compiling programs for changes"  # the last stage, after which the scene is complete
 
 
+_TELLING = 5.0  # most seconds in which a page that follows learns of an error
+
+
 class EndedError(Exception):
     """Nobody waits for the work any more."""
 
@@ -22,7 +25,7 @@ class Progress:
         self._share: float | None = None
         self._way: _Way | None = None
         self._error: BaseException | None = None
-        self._prepared = self._finished = self._told = False
+        self._prepared = self._finished = self._asked = self._told = False
 
     def plan(self, stages: Sequence[tuple[str, float]]) -> None:
         """Sets what will be done, so that the page shows one share for the whole way. It never falls.
@@ -65,12 +68,12 @@ class Progress:
         """Waits until the scene is complete.
 
         Args:
-            patience: If there is an error, most seconds to wait until a page was told of it.
+            patience: If there is an error, most seconds to wait until a page was told of it; longer if one has asked.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._prepared or self._finished)
             if self._error is not None:
-                self._changed.wait_for(lambda: self._told, patience)
+                self._changed.wait_for(lambda: self._told, _TELLING if self._asked else patience)
                 raise self._error
 
     @property
@@ -81,6 +84,7 @@ class Progress:
     def content(self) -> JsonObject:
         """The message to the page."""
         with self._changed:
+            self._asked = True
             content = {"kind": "progress", "stage": self._stage, "fraction": self._share, "finished": self._finished}
             if self._error is None or not self._finished:
                 return content

@@ -7,15 +7,16 @@ import numpy as np
 from PIL import Image
 
 import jaxprt as prt
+from jaxprt.cli import lights
 
 SMALL = ("--ground", "--size", "32", "--light-size", "8", "--lobes", "1", "--brdf", "lambert", "--refine", "off")
 
 
 def test_each_light_has_its_picture_and_its_name_on_the_sheet(main, place, tmp_path, capsys):
     path, store = tmp_path / "sheet.png", tmp_path / "store"
-    lights = [place / "sky.exr", place / "dusk.exr"]
+    skies = [place / "sky.exr", place / "dusk.exr"]
     options = ["--turn", "0,90", "--output", path, "--store", store, "--json"]
-    assert main("lights", *SMALL, *options, place / "mesh.obj", *lights) == 0
+    assert main("lights", *SMALL, *options, place / "mesh.obj", *skies) == 0
     assert json.loads(capsys.readouterr().out)["lights"] == ["sky_0", "sky_90", "dusk_0", "dusk_90"]
     sheet = np.asarray(Image.open(path)) / 255
     assert sheet.shape == (2 * (32 + 28), 2 * 32, 3)
@@ -29,12 +30,23 @@ def test_each_light_has_its_picture_and_its_name_on_the_sheet(main, place, tmp_p
     # The same picture as `jaxprt relight` makes, but for the exposure of each.
     out = tmp_path / "out"
     relight = ["--system", "lobe", "--lobes", "1", "--size", "32", "--light-size", "8", "--ground", "--brdf", "lambert"]
-    assert main("relight", *relight, "--refine", "off", "--output", out, place / "mesh.obj", lights[1]) == 0
+    assert main("relight", *relight, "--refine", "off", "--output", out, place / "mesh.obj", skies[1]) == 0
     linear, _ = prt.files.read_image(out / "dusk_lobe.exr")
     found = np.asarray(prt.image.decode_srgb(jnp.asarray(pictures[2])))
     inside = np.all((found > 0.05) & (found < 0.95), -1)
     ratio = found[inside] / linear[inside]
     assert np.std(ratio) < 0.03 * np.mean(ratio)
+
+
+def test_names_become_smaller_and_lose_their_middle_where_they_are_too_wide():
+    long = "a_really_long_name_of_an_environment_map_180"
+    shown, height = lights._fitting(long, 128)
+    assert height == 9
+    assert shown.startswith("a_really")
+    assert shown.endswith("_180")
+    assert "…" in shown
+    assert lights._fitting("uffizi_latlong_256x128", 128)[0] == "uffizi_latlong_256x128"
+    assert lights._fitting("sky", 128) == ("sky", 16)
 
 
 def test_what_a_sheet_cannot_have_is_refused(main, place, tmp_path, capsys):

@@ -136,7 +136,7 @@ def test_every_control_has_a_name_and_is_reached_by_keys(hand):
         reached.add(hand.page.evaluate(FOCUSED))
     for name in (
         "save a picture, a video or the state",
-        "reset the view, the light and the materials (R)",
+        "reset the view, the light, the materials and the display (R)",
         "rotation °",
         "rotation °, typed",
     ):
@@ -454,6 +454,13 @@ def test_a_picture_of_any_size_is_saved_with_alpha(hand, systems, lights, sessio
         bar.wait_for()
         assert hand.page.locator(".stagetext").text_content() == "a picture of 50 x 30 pixels"
     bar.wait_for(state="hidden")
+    hand.page.get_by_role("button", name="save a picture").click()
+    hand.page.get_by_role("button", name="save", exact=True).click()
+    hand.page.get_by_role("button", name="cancel").click()
+    hand.page.get_by_role("button", name="save a picture").click()  # while Python is still at what was given up
+    assert hand.page.get_by_label("what").is_enabled()
+    assert hand.page.locator("dialog .note").text_content() == ""
+    hand.page.get_by_role("button", name="cancel").click()
 
 
 def test_the_dialog_opens_with_what_was_saved_last_and_without_what_was_canceled(hand):

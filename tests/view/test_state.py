@@ -168,6 +168,38 @@ def test_the_address_holds_the_state_and_a_file_shows_it_again(browser, server, 
     assert not other.errors
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("%7B%22jaxprt", "the address holds no state: "),
+        ("%E0%A4%A", "the address holds no state: "),
+        (
+            '{"jaxprt":"state","light":"moon","eye":[2,1.5,4],"target":[0,0,0],"field_of_view":0.7}',
+            "the scene lacks the",
+        ),
+    ],
+)
+def test_an_address_that_does_not_fit_is_told_until_something_changes(browser, server, text, words):
+    made = Hand(browser, f"{server.url}#{text}")
+    made.finish()
+    assert made.page.evaluate(f"() => {TOLD}").startswith(words)
+    made.drag((100, 100), (110, 100))
+    made.page.wait_for_function(f"() => !{TOLD}")
+    made.page.close()
+    assert not made.errors
+
+
+def test_a_picture_that_is_higher_than_wide_shows_as_much_across(browser, server, hand):
+    narrow = Hand(browser, server.url)
+    narrow.page.set_viewport_size({"width": 200, "height": 400})
+    narrow.page.keyboard.press("r")
+    narrow.settle()
+    box = narrow.page.locator("canvas.canvas").bounding_box()
+    further = hand.camera()["distance"] * box["height"] / box["width"]
+    assert narrow.camera()["distance"] == pytest.approx(further)
+    narrow.page.close()
+
+
 def test_python_draws_a_state_as_the_viewer_did(session, systems, lights, look, tmp_path):
     """By the scene, the light and the camera that a state's file makes, without the session."""
     material = {"ball": {"roughness": 0.7, "metallic": 1.0}}

@@ -21,8 +21,10 @@ _FILES = (
     "saving",
     "frame",
     "piece",
+    "answers",
     "waiting",
     "viewer",
+    "widget",
 )
 
 

@@ -13,6 +13,7 @@ const ICONS = {
   picture: "M2 5h3l1.5-2h3L11 5h3v8H2zM8 11.2a2.4 2.4 0 1 0 0-4.8 2.4 2.4 0 0 0 0 4.8z",
   undo: "M6 3 2.5 6.5 6 10M2.5 6.5H9a4 4 0 0 1 0 7H7",
   redo: "M10 3l3.5 3.5L10 10M13.5 6.5H7a4 4 0 0 0 0 7h2",
+  frame: "M2 5.5V2h3.5M10.5 2H14v3.5M14 10.5V14h-3.5M5.5 14H2v-3.5M6 6h4v4H6z",
   reset: "M3 8a5 5 0 1 0 1.6-3.7M3 2.5v3h3",
   theme: "M8 13.5a5.5 5.5 0 1 0 0-11zM8 2.5a5.5 5.5 0 0 0 0 11",
   help: "M5.8 6a2.2 2.2 0 1 1 3.2 2c-.7.4-1 .8-1 1.6M8 12.2v.1",
@@ -31,7 +32,7 @@ export function fillPage(page) {
   styled(page, "body { margin: 0; height: 100vh; background: #1a1a1a; } #viewer { height: 100%; }");
 }
 
-// The elements of a viewer in `shadow`. `on` has what its buttons do: `reset`, `undo`, and `save` with what is chosen.
+// The elements of a viewer in `shadow`. `on` has what its buttons do: `reset`, `undo`, `frame`, and `save` with what is chosen.
 export function frameOf(shadow, on) {
   styled(shadow, STYLE);
   const frame = element("div", shadow, { className: "frame" });
@@ -74,7 +75,8 @@ export function frameOf(shadow, on) {
   help.querySelector("button").onclick = toggleHelp;
   tool("picture", "save a picture, a video or the state", () => dialog.open());
   const [undo, redo] = [tool("undo", "undo (Z)", () => on.undo(-1)), tool("redo", "redo (Y)", () => on.undo(1))];
-  tool("reset", "reset the view, the light and the materials (R)", on.reset);
+  tool("frame", "show all of the part that was opened last, or of the scene (F)", on.frame);
+  tool("reset", "reset the view, the light, the materials and the display (R)", on.reset);
   tool("theme", "dark or light", () => theme(!frame.classList.contains("light")));
   tool("help", "help (H)", toggleHelp);
   const unfold = tool("panel", "controls", () => fold(!frame.classList.contains("folded")));

@@ -51,10 +51,12 @@ export function dialogOf(parent, canvas, { make, python }) {
     seconds.parentElement.hidden = seconds.disabled = !lasting;
   };
   let saved = null;
-  let stopped = null; // the choices of the last picture that was saved, and what ends a video
+  let stopped = null; // the choices of the last picture that was saved, and what gives up the present one
   kind.onchange = show;
   cancel.onclick = () => {
     stopped?.abort();
+    stopped = null;
+    lock(false);
     dialog.close();
   };
   form.onsubmit = async (event) => {
@@ -66,17 +68,18 @@ export function dialogOf(parent, canvas, { make, python }) {
       seconds: Number(seconds.value),
       transparent: clear.checked,
     };
-    stopped = new AbortController();
+    const own = (stopped = new AbortController()).signal;
     lock(true);
     note.textContent = "it is being made";
     try {
       const { blob, name } = await make(
         choice,
         (text) => {
-          note.textContent = text;
+          if (!own.aborted) note.textContent = text;
         },
-        stopped.signal,
+        own,
       );
+      if (own.aborted) return;
       const link = element("a", form, { href: URL.createObjectURL(blob), download: name });
       link.click();
       link.remove();
@@ -84,6 +87,7 @@ export function dialogOf(parent, canvas, { make, python }) {
       saved = choice;
       dialog.close();
     } catch (error) {
+      if (own.aborted) return;
       note.textContent = error.message;
     }
     stopped = null;
@@ -116,6 +120,28 @@ export function dialogOf(parent, canvas, { make, python }) {
       if (!width.disabled) width.select();
     },
   };
+}
+
+// Pixels that the graphics card has drawn as a PNG file, with an image over them.
+export async function drawn({ pixel, parts }, width, height, over = null) {
+  const row = 4 * parts * width;
+  const canvas = Object.assign(document.createElement("canvas"), { width, height });
+  const context = canvas.getContext("2d");
+  const image = context.createImageData(width, height);
+  for (let y = 0, to = 0; y < height; y++)
+    for (let x = 0; x < width; x++, to += 4) {
+      const low = parts * ((height - 1 - y) * row + 4 * x);
+      const sum = [0, 0, 0, 0]; // rows come from below
+      for (let i = 0; i < parts; i++)
+        for (let j = 0; j < parts; j++) for (let c = 0; c < 4; c++) sum[c] += pixel[low + i * row + 4 * j + c];
+      for (let c = 0; c < 3; c++) image.data[to + c] = sum[3] && (255 * sum[c]) / sum[3];
+      image.data[to + 3] = sum[3] / parts ** 2;
+    }
+  context.putImageData(image, 0, 0);
+  if (over) context.drawImage(over, 0, 0);
+  const file = await new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
+  if (!file) throw new Error(`this browser cannot make a picture of ${width} x ${height} pixels`);
+  return file;
 }
 
 // A video of pictures. `picture` makes the one of a share of the whole, from 0 on. Browsers record what a canvas shows,

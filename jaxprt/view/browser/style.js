@@ -26,7 +26,7 @@ button.main { background: var(--mark); border-color: var(--mark); color: var(--m
 .busy::before { content: ""; display: block; height: 100%; width: calc(100% * var(--part, 0.3)); background: var(--mark); transition: width .2s; }
 .busy.open::before { animation: along 1.4s ease-in-out infinite; }
 @keyframes along { from { transform: translateX(-100%); } to { transform: translateX(334%); } }
-.words { position: absolute; left: 8px; top: 8px; max-width: calc(100% - 270px); display: flex; flex-direction: column; align-items: flex-start; gap: 4px; pointer-events: none; }
+.words { position: absolute; left: 8px; top: 8px; max-width: calc(100% - 305px); display: flex; flex-direction: column; align-items: flex-start; gap: 4px; pointer-events: none; }
 .stagetext, .told { padding: 2px 8px; border-radius: 4px; background: var(--over); overflow-wrap: anywhere; }
 .stagetext { color: var(--dim); font-variant-numeric: tabular-nums; }
 .told { border-left: 3px solid var(--mark); }

@@ -1,5 +1,5 @@
 // The viewer: mesh and camera live here, colors come from Python. The same module runs in notebooks (anywidget calls
-// `render`) and on a page of its own (`mount`). No libraries.
+// `render` of widget.js) and on a page of its own (`mount`). No libraries.
 
 import { add, clamp, decompressed, drawnSize, inflate, unit } from "./common.js";
 import { Camera, meet } from "./camera.js";
@@ -10,11 +10,12 @@ import { Pixels } from "./pixels.js";
 import { panelOf } from "./panel.js";
 import { gestures } from "./gestures.js";
 import { frameOf } from "./frame.js";
-import { materials, video } from "./saving.js";
+import { drawn, materials, video } from "./saving.js";
 import { Waiting, follow } from "./waiting.js";
 
 const MESHES = /\.(glb|gltf|obj|ply|stl|off)$/i; // of files that are scenes
 const LIGHTS = /\.(hdr|exr|pic|json)$/i; // what does not belong to scenes
+const IMAGES = /\.(png|jpe?g|tiff?|pfm|bmp|webp|ktx2)$/i; // which may be lights
 const SMALL = { width: 72, height: 54 }; // pixels of the pictures of lights in the panel
 const SKY_ROWS = 1024; // of the picture of a light at rest, if its file has so many
 
@@ -29,6 +30,7 @@ export function mount(root, ask, { addressed = false } = {}) {
   const view = frameOf(shadow, {
     reset: () => scene && reset(),
     undo: (by) => scene && past.step(by),
+    frame: () => scene && frameAll(),
     save: { make: (...choice) => save(...choice), python: () => scene?.rests.includes("picture") },
   });
   const { frame, canvas, panel, line, help, tell, busy } = view;
@@ -143,6 +145,7 @@ export function mount(root, ask, { addressed = false } = {}) {
   };
   let looked = 0; // answers of Python
   let notice = ""; // what stays said until the next change
+  let fault = ""; // why there is no better scene
   // The GPU's scene: what it holds of a system, asked for once. Other states have their colors from Python.
   let gpu = null;
   let asked = "";
@@ -198,7 +201,7 @@ export function mount(root, ask, { addressed = false } = {}) {
       drawing.unexposed = true;
     }
     Object.assign(stats, { got: stats.got + 1, shown: seq });
-    tell(notice);
+    tell(notice || fault);
     describe();
     redraw();
     sky();
@@ -246,7 +249,7 @@ export function mount(root, ask, { addressed = false } = {}) {
         stats.got++;
         stats.bytes += sent;
         stats.shown = Math.max(stats.shown, content.seq); // the GPU may have shown a newer state
-        if (content.seq === seq) tell(notice);
+        if (content.seq === seq) tell(notice || fault);
         const rate = framed ? 1000 / (performance.now() - framed) : 0;
         framed = performance.now();
         if (!drawing.gpu) status(content.ms, rate, sent);
@@ -476,7 +479,7 @@ export function mount(root, ask, { addressed = false } = {}) {
     try {
       give(decodeURIComponent(location.hash.slice(1)));
     } catch (error) {
-      tell(`the address holds no state: ${error.message}`);
+      tell((notice = `the address holds no state: ${error.message}`));
     }
   };
   if (addressed) window.addEventListener("hashchange", arrived);
@@ -510,6 +513,10 @@ export function mount(root, ask, { addressed = false } = {}) {
       const opens = files.some(({ place }) => MESHES.test(place));
       const parts = files.filter(({ place }) => opens && !LIGHTS.test(place));
       for (const { file } of files.filter((each) => !parts.includes(each))) {
+        if (!IMAGES.test(file.name) && !LIGHTS.test(file.name))
+          throw new Error(
+            `${file.name} must be a scene (GLB, glTF, OBJ, PLY, STL, OFF), a light (HDR, EXR) or a state (JSON)`,
+          );
         if (/\.json$/i.test(file.name)) {
           try {
             give(await file.text());
@@ -523,6 +530,7 @@ export function mount(root, ask, { addressed = false } = {}) {
         set({ light: content.light, lamps: [] });
       }
       if (!opens) return;
+      fault = "";
       await sent(
         "open",
         { names: parts.map(({ place }) => place) },
@@ -534,10 +542,16 @@ export function mount(root, ask, { addressed = false } = {}) {
       tell(error.message);
     }
   };
+  // The scene's own camera, further away where the picture is higher than wide.
+  const home = () => {
+    const result = new Camera(scene);
+    result.distance /= Math.min(1, canvas.clientWidth / (canvas.clientHeight || 1)) || 1;
+    return result;
+  };
   const reset = () => {
-    camera = new Camera(scene);
+    camera = home();
     exposed = null;
-    set({ turn: 0, lamps: [], materials: {}, auto: true });
+    set({ light: 0, turn: 0, lamps: [], materials: {}, auto: true, tone: "srgb", background: "light" });
   };
   // What is seen at a place of the picture, from -1 to 1: the point, and the part that it belongs to.
   const seen = (x, y) => {
@@ -637,7 +651,7 @@ export function mount(root, ask, { addressed = false } = {}) {
   const heard = (content) => {
     if (closed) return;
     if (content.kind === "error") return tell(content.message);
-    if (content.error) tell(content.error);
+    if (content.error) tell((fault = content.error));
     waiting.set("progress", content.finished ? "" : content.stage, content.fraction);
     if (content.version > (scene?.version ?? 0)) load();
     else if (scene && content.lights > scene.lights.length) more();
@@ -705,7 +719,7 @@ export function mount(root, ask, { addressed = false } = {}) {
         past.forget();
         view.steps(false, false);
       }
-      camera ??= new Camera(scene);
+      camera ??= home();
       drawing.setMesh(scene.position, scene.face, scene.backs);
       if (controlled !== panelled) {
         controls = panelOf(panel, scene, state, {
@@ -725,8 +739,8 @@ export function mount(root, ask, { addressed = false } = {}) {
       small.clear(); // of a scene with fewer shadows
       controls.show();
       resize();
-      if (first && addressed && location.hash.length > 1) arrived();
       moved();
+      if (first && addressed && location.hash.length > 1) arrived();
       past.amend();
     } catch (error) {
       tell(`no answer from Python: ${error.message}`);
@@ -789,65 +803,3 @@ export function mount(root, ask, { addressed = false } = {}) {
     drawing.close();
   };
 }
-
-// Pixels that the graphics card has drawn as a PNG file, with an image over them.
-async function drawn({ pixel, parts }, width, height, over = null) {
-  const row = 4 * parts * width;
-  const canvas = Object.assign(document.createElement("canvas"), { width, height });
-  const context = canvas.getContext("2d");
-  const image = context.createImageData(width, height);
-  for (let y = 0, to = 0; y < height; y++)
-    for (let x = 0; x < width; x++, to += 4) {
-      const low = parts * ((height - 1 - y) * row + 4 * x);
-      const sum = [0, 0, 0, 0]; // rows come from below
-      for (let i = 0; i < parts; i++)
-        for (let j = 0; j < parts; j++) for (let c = 0; c < 4; c++) sum[c] += pixel[low + i * row + 4 * j + c];
-      for (let c = 0; c < 3; c++) image.data[to + c] = sum[3] && (255 * sum[c]) / sum[3];
-      image.data[to + 3] = sum[3] / parts ** 2;
-    }
-  context.putImageData(image, 0, 0);
-  if (over) context.drawImage(over, 0, 0);
-  const file = await new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
-  if (!file) throw new Error(`this browser cannot make a picture of ${width} x ${height} pixels`);
-  return file;
-}
-
-// For anywidget: messages have numbers, by which answers find their questions.
-function render({ model, el }) {
-  const waiting = new Map();
-  let last = 0;
-  let lost = false;
-  const heard = (content, buffers) => {
-    const each = waiting.get(content.id);
-    if (!each) return;
-    waiting.delete(content.id);
-    el.classList.add("jaxprt-live"); // which hides the picture that a notebook without a kernel shows
-    each.resolve({ content: content.content, buffers });
-  };
-  const restarted = () => new Error("the kernel was restarted; run the cell again");
-  const cut = () => {
-    lost = true;
-    for (const each of waiting.values()) each.reject(restarted());
-    waiting.clear();
-  };
-  model.on("msg:custom", heard);
-  model.on("comm_live_update", cut); // of JupyterLab, when its kernel is gone
-  const ask = (content, buffers = []) =>
-    new Promise((resolve, reject) => {
-      if (lost) return reject(restarted());
-      const id = `${Date.now()}-${Math.random()}-${++last}`;
-      waiting.set(id, { resolve, reject });
-      setTimeout(() => {
-        if (waiting.delete(id)) reject(new Error("the kernel was restarted, or is busy"));
-      }, 120000);
-      model.send({ id, content }, undefined, buffers);
-    });
-  el.style.height = `${model.get("height")}px`;
-  const close = mount(el, ask);
-  return () => {
-    model.off("msg:custom", heard);
-    model.off("comm_live_update", cut);
-    close();
-  };
-}
-export default { render };
