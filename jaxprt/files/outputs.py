@@ -8,12 +8,13 @@ import re
 import secrets
 import shutil
 import stat
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import OpenImageIO
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
 
 from jaxprt import require
 from jaxprt.files import pixels
@@ -145,6 +146,27 @@ def _name_error(path: str | os.PathLike, error: OSError) -> OSError:
     named = type(error)(words)
     named.errno = error.errno
     return named
+
+
+def webp(image: UInt8[np.ndarray, "h w 3"], *, quality: int | None) -> bytes:
+    """A WebP file of display values.
+
+    Args:
+        image: The bytes of the pixels, first row on top.
+        quality: From 0 to 100; None for an exact file.
+
+    Raises:
+        OSError: The file cannot be made.
+    """
+    spec = OpenImageIO.ImageSpec(image.shape[1], image.shape[0], 3, "uint8")
+    spec.attribute("compression", "lossless" if quality is None else f"webp:{quality}")
+    with tempfile.TemporaryDirectory() as folder:
+        path = os.path.join(folder, "image.webp")
+        file = OpenImageIO.ImageOutput.create(path)
+        if not (file and file.open(path, spec) and file.write_image(np.ascontiguousarray(image)) and file.close()):
+            size = f"{image.shape[1]} x {image.shape[0]}"
+            raise OSError(f"an image of {size} pixels could not be written as WebP: {OpenImageIO.geterror()}")
+        return pathlib.Path(path).read_bytes()
 
 
 def write_exr(

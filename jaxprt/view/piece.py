@@ -6,14 +6,12 @@ import hashlib
 import html
 import os
 import pathlib
-import tempfile
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import OpenImageIO
 
 from jaxprt import require
 from jaxprt.files import outputs
@@ -259,16 +257,7 @@ def _with_image_files(content: JsonObject, arrays: list[bytes]) -> tuple[JsonObj
 def _webp(data: bytes, width: int, height: int, channels: int, colored: bool, *, exact: bool) -> bytes:
     """An image as a file for browsers. Other values than colors are kept as they are in any case."""
     rows = np.broadcast_to(np.frombuffer(data, np.uint8).reshape(height, width, channels), (height, width, 3))
-    spec = OpenImageIO.ImageSpec(width, height, 3, "uint8")
-    spec.attribute("compression", f"webp:{_QUALITY}" if colored and not exact else "lossless")
-    with tempfile.TemporaryDirectory() as folder:
-        path = os.path.join(folder, "image.webp")
-        file = OpenImageIO.ImageOutput.create(path)
-        if file is None or not (
-            file.open(path, spec) and file.write_image(np.ascontiguousarray(rows)) and file.close()
-        ):
-            raise OSError(f"an image of {width} x {height} texels could not be written: {OpenImageIO.geterror()}")
-        return pathlib.Path(path).read_bytes()
+    return outputs.webp(rows, quality=_QUALITY if colored and not exact else None)
 
 
 def _skies(session: Session, room: int | float) -> list[Reply | None]:

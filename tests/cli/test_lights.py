@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image
 
 import jaxprt as prt
-from jaxprt.cli import lights
+from jaxprt.files import captions
 
 SMALL = ("--ground", "--size", "32", "--light-size", "8", "--lobes", "1", "--brdf", "lambert", "--refine", "off")
 
@@ -40,13 +40,13 @@ def test_each_light_has_its_picture_and_its_name_on_the_sheet(main, place, tmp_p
 
 def test_names_become_smaller_and_lose_their_middle_where_they_are_too_wide():
     long = "a_really_long_name_of_an_environment_map_180"
-    shown, height = lights._fitting(long, 128)
+    shown, height = captions.fitting(long, 128)
     assert height == 9
     assert shown.startswith("a_really")
     assert shown.endswith("_180")
     assert "…" in shown
-    assert lights._fitting("uffizi_latlong_256x128", 128)[0] == "uffizi_latlong_256x128"
-    assert lights._fitting("sky", 128) == ("sky", 16)
+    assert captions.fitting("uffizi_latlong_256x128", 128)[0] == "uffizi_latlong_256x128"
+    assert captions.fitting("sky", 128) == ("sky", 16)
 
 
 def test_what_a_sheet_cannot_have_is_refused(main, place, tmp_path, capsys):

@@ -113,12 +113,12 @@ def test_a_second_run_takes_the_transport_from_the_first(run, plain, tmp_path, c
 
 def test_a_state_of_the_viewer_is_what_is_drawn(run, tmp_path, capsys):
     file, state = tmp_path / "kept.json", {"jaxprt": "state", "light": "sky", "turn": 0.5, "tone": "neutral"}
-    state |= {"eye": [1.0, 2.0, 3.0], "target": [0.0, 0.5, 0.0], "field_of_view": 0.5, "aspect": 2.0, "stops": -1.5}
+    state |= {"eye": [1.0, 2.0, 3.0], "target": [0.0, 0.5, 0.0], "field_of_view": 0.5, "aspect": 1.0, "stops": -1.5}
     file.write_text(json.dumps(state))
     assert run(*PLAIN, "--state", file, output=tmp_path / "out") == 0
     told = report(tmp_path / "out")
     camera = told["camera"]
-    assert (camera["width"], camera["height"]) == (64, 32)
+    assert (camera["width"], camera["height"]) == (32, 32)
     for name in ("eye", "target", "field_of_view"):
         np.testing.assert_allclose(camera[name], state[name], rtol=1e-6)
     assert told["lights"]["sky"]["exposure_stops"] == -1.5
