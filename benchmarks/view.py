@@ -6,7 +6,8 @@ First a process of `jaxprt view`, asked over HTTP as the browser's page asks: fr
 browser's GPU needs for colors without shadows, with coarse shadows, and of full quality, and to the end of what is
 compiled ahead. `cold` has neither programs nor precomputation of earlier processes, `programs` has programs, and
 `stored` has both. What the browser itself takes is not included. Without --quick the scene is a file, if
-JAXPRT_DATA names a folder of files.
+JAXPRT_DATA names a folder of files; then its first frame on the screen of Chromium follows, without a graphics card,
+of three starts the middle one.
 
 Then looks, for browsers whose GPU does not shade: the embedded scene by lobes, with direct light, one bounce and two.
 Each time is from the question to the last byte of the answer. `bytes` are those of an answer, whose half floats the
@@ -18,6 +19,7 @@ import dataclasses
 import http.client
 import os
 import pathlib
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -37,6 +39,7 @@ from jaxprt.scene import TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
 from jaxprt.view import messages
 
+_FOREIGN, _STARTS = "foreign/craft_speederD.gltf", 3  # and how often it is started
 _FILES = "scenes/Duck.glb", "env/uffizi_latlong_256x128.hdr"  # in JAXPRT_DATA
 
 
@@ -128,7 +131,7 @@ class Preparation:
             command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment
         )
         assert self._process.stdout is not None
-        self._url = self._process.stdout.readline().split()[1]
+        self.url = self._process.stdout.readline().split()[1]
 
     def processor_seconds(self) -> float | None:
         """Seconds that the process has computed, on all cores; None where the system does not tell."""
@@ -147,7 +150,7 @@ class Preparation:
 
     def events(self) -> Generator[tuple[str, float, int], None, None]:
         """What the page has got, after how many seconds, and bytes of the answers."""
-        place = urllib.parse.urlsplit(self._url)
+        place = urllib.parse.urlsplit(self.url)
         connection = http.client.HTTPConnection(str(place.hostname), place.port, timeout=600)
 
         def ask(content: dict[str, Any]) -> tuple[dict[str, Any], list[bytes]]:
@@ -202,9 +205,49 @@ def preparations(*, quick: bool) -> Iterator[dict[str, Any]]:
                 process.close()
 
 
+def first_frames() -> Iterator[dict[str, Any]]:
+    """The first frame of a foreign file in a browser that is already open: cold, and with programs."""
+    data, chromium = os.environ.get("JAXPRT_DATA"), shutil.which("chromium") or shutil.which("chromium-browser")
+    if data is None or chromium is None:
+        return
+    from playwright.sync_api import sync_playwright
+
+    switches = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+    canvas = "document.querySelector('#viewer')?.shadowRoot?.querySelector('.canvas')"
+    with sync_playwright() as playwright, tempfile.TemporaryDirectory() as kept:
+        browser = playwright.chromium.launch(executable_path=chromium, args=switches)
+        for case in ("cold", "programs"):
+            spent = []
+            for _ in range(_STARTS + (case == "programs")):
+                with tempfile.TemporaryDirectory() as folder:
+                    process = Preparation([os.path.join(data, _FOREIGN)], folder if case == "cold" else kept)
+                    page = browser.new_page(viewport={"width": 1100, "height": 700})
+                    page.goto(process.url)
+                    page.wait_for_function(
+                        f"() => {canvas}?.stats?.draws > 0 && {canvas}.pixels?.()?.message", polling=50
+                    )
+                    page.screenshot()  # waits for the renderer
+                    spent.append(time.perf_counter() - process.began)
+                    page.close()
+                    process.close()
+            times = np.sort(spent[case == "programs" :])  # the first one compiles
+            yield {
+                "benchmark": "view",
+                "case": f"{case}: first frame on the screen",
+                "seconds": float(np.median(times)),
+                "spread": float(np.ptp(times) / np.median(times)),
+                "compile_seconds": 0.0,
+                "error": None,
+                "bytes": 0,
+            }
+        browser.close()
+
+
 def main(options: Sequence[str] | None = None) -> None:
     arguments = harness.parser(str(__doc__).splitlines()[0]).parse_args(options)
     for line in preparations(quick=arguments.quick):
+        harness.report(line, arguments.output)
+    for line in () if arguments.quick else first_frames():
         harness.report(line, arguments.output)
     for bounces in (0,) if arguments.quick else (0, 1, 2):
         for line in hands(bounces, quick=arguments.quick):

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import equinox as eqx
@@ -310,6 +311,13 @@ def camera(parts: Sequence[Part], *, azimuth: float = 20.0, elevation: float = 1
     """
     azimuth, elevation = np.radians([azimuth, elevation])
     return orbit(Scene(parts).mesh, azimuth=azimuth, elevation=elevation, width=size, height=size)
+
+
+def objects(scene: Scene, chosen: SimpleNamespace) -> Sequence[Part]:
+    """The parts that pictures show whole. The board of the embedded scene and the ground may extend beyond them."""
+    if not split_files(chosen.files)[0]:
+        return scene.parts[:1]
+    return scene.parts[: -1 if chosen.ground else None]
 
 
 def _with_materials(scene: Scene, materials: Sequence[tuple[str, Callable | TexturedMaterial]]) -> Scene:

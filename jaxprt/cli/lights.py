@@ -29,7 +29,7 @@ _LINE = 28  # pixels below each picture for the name of its light
     options.FILES,
     Scene=options.SCENE,
     Light=options.LIGHT,
-    Camera=options.options_of(inputs.camera, azimuth=options.DEGREES, elevation=options.ELEVATION, size=options.PIXELS),
+    Camera=options.CAMERA,
     System=[options.systems(("lobe", "harmonic", "dynamic"), "Of the scene."), options.NO_BOUNCES],
     Sizes=options.FEW_SIZES,
     Output=[
@@ -67,8 +67,7 @@ def command(chosen: SimpleNamespace) -> options.Result:
         raise click.UsageError("a sheet is of one system and one number of lobes, got several")
     options.make_folder(chosen.store)
     (system,), scene = chosen.system, two_sided(centered(options.call(inputs.scene, chosen)))
-    seen = scene.parts[: -1 if chosen.ground else None] if inputs.split_files(chosen.files)[0] else scene.parts[:1]
-    camera = options.call(inputs.camera, chosen, parts=seen)
+    camera = options.call(inputs.camera, chosen, parts=inputs.objects(scene, chosen))
     (recipe,) = options.recipes(system, chosen).values()
     progress, store = sys.stderr.isatty(), chosen.store and chosen.store / system
     wanted = {"size": chosen.light_size or inputs.LIGHT_SIZE, "bounces": chosen.bounces, "path": store}

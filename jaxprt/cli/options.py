@@ -253,6 +253,7 @@ SCENE = options_of(
     brdf=Material(),
     material=Material(of_part=True),
 )
+CAMERA = options_of(inputs.camera, azimuth=DEGREES, elevation=ELEVATION, size=PIXELS)
 LIGHT_SIZE = options_of(inputs.lights, light_size=Range(1, 1024))
 LIGHT = [*options_of(inputs.lights, turn=Several(DEGREES)), *LIGHT_SIZE]
 JSON = option("json", "Print the result as JSON on stdout.", bool)

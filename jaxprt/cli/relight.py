@@ -45,7 +45,7 @@ class Shard(click.ParamType):
     Scene=options.SCENE,
     Light=options.LIGHT,
     Camera=[
-        *options.options_of(inputs.camera, azimuth=options.DEGREES, elevation=options.ELEVATION, size=options.PIXELS),
+        *options.CAMERA,
         {"state": (click.Path(exists=True, path_type=Path, dir_okay=False),)},
     ],
     System=[
@@ -136,9 +136,7 @@ def _view(chosen: SimpleNamespace, plan: Plan | None) -> View:
         return _view_of(state, chosen, plan)
     scene = two_sided(centered(options.call(inputs.scene, chosen)))
     lights = options.call(inputs.lights, chosen, light_size=_light_size(chosen, plan))
-    # The board of the embedded scene and the ground may extend beyond the picture.
-    seen = scene.parts[:1] if not inputs.split_files(chosen.files)[0] else scene.parts[: -1 if chosen.ground else None]
-    return View(scene, lights, options.call(inputs.camera, chosen, parts=seen), chosen.tone)
+    return View(scene, lights, options.call(inputs.camera, chosen, parts=inputs.objects(scene, chosen)), chosen.tone)
 
 
 def _view_of(state: State, chosen: SimpleNamespace, plan: Plan | None) -> View:

@@ -175,8 +175,7 @@ class Session:
             environments: Dictionary from names to lights.
         """
         _check_lights(environments)
-        self._scenes += 1
-        self._replace({name: scene}, environments, preview=True)
+        self._replace({name: scene}, environments, preview=True, another=True)
 
     def _replace(
         self,
@@ -184,11 +183,13 @@ class Session:
         environments: Mapping[str, Environment] | None,
         *,
         preview: bool,
+        another: bool = False,
     ) -> None:
         new = Stages(systems, environments or {})
         with self._lock:
             if self._superseded:
                 raise EndedError
+            self._scenes += another
             old = self._version
             if environments is None and old is not None:
                 new.name, new.lights = old.stages.name, old.stages.lights

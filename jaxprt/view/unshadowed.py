@@ -18,7 +18,7 @@ class Unshadowed:
 
     Attributes:
         scene: The scene, with copies of faces whose backs are lit, and its origin at zero.
-        origin: Its origin before.
+        origin: Origin of the scene in its files, of which `scene` has none.
         shading: Mesh, BRDF and channel weights of each part.
     """
 

@@ -65,6 +65,18 @@ class Hand:
         self.page.mouse.up(button=button)
         self.settle()
 
+    def drop(self, files):
+        """Drops files, whose bytes are given by their names."""
+        self.page.evaluate(
+            f"""(files) => {{
+                const data = new DataTransfer();
+                for (const [name, bytes] of files) data.items.add(new File([new Uint8Array(bytes)], name));
+                const fields = {{ dataTransfer: data, bubbles: true, composed: true }};
+                ({CANVAS}).dispatchEvent(new DragEvent("drop", fields));
+            }}""",
+            [[name, list(data)] for name, data in files.items()],
+        )
+
     def pixels(self):
         """What the canvas shows, in [0, 1], read from its drawing."""
         text = self.page.evaluate(f"() => ({CANVAS}).toDataURL('image/png')")

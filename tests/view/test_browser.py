@@ -153,22 +153,10 @@ def test_a_point_in_the_plane_and_a_color_change_the_material(hand):
     assert np.abs(hand.pixels() - before).max() > 0.1
 
 
-def drop(hand, name, data):
-    """Drops a file on the viewer."""
-    hand.page.evaluate(
-        f"""([name, data]) => {{
-            const given = new DataTransfer();
-            given.items.add(new File([new Uint8Array(data)], name));
-            ({CANVAS}).dispatchEvent(new DragEvent("drop", {{ dataTransfer: given, bubbles: true, composed: true }}));
-        }}""",
-        [name, list(data)],
-    )
-
-
 def test_a_dropped_file_is_the_light_and_another_one_says_what_is_wrong(hand, tmp_path):
     path = tmp_path / "red.exr"
     files.write_exr(path, np.broadcast_to(np.float32([0.5, 0, 0]), (8, 16, 3)))
-    drop(hand, "red.exr", path.read_bytes())
+    hand.drop({"red.exr": path.read_bytes()})
     hand.page.wait_for_function(f"() => ({CANVAS}).state.light === 2")
     hand.settle()
     for _ in range(20):
@@ -178,7 +166,7 @@ def test_a_dropped_file_is_the_light_and_another_one_says_what_is_wrong(hand, tm
             break
     assert shown[..., 1:].max() < 0.02
     assert shown[..., 0].mean() > 0.3
-    drop(hand, "poem.txt", b"roses are red")
+    hand.drop({"poem.txt": b"roses are red"})
     hand.page.wait_for_function(f"() => {TOLD}.includes('poem.txt')")
     assert hand.state()["light"] == 2
 
@@ -284,7 +272,7 @@ def test_a_light_that_was_dropped_on_another_page_is_there_when_the_hand_comes_b
     path = tmp_path / "green.exr"
     files.write_exr(path, np.broadcast_to(np.float32([0, 0.5, 0]), (8, 16, 3)))
     other = Hand(browser, server.url)
-    drop(hand, path.name, path.read_bytes())
+    hand.drop({path.name: path.read_bytes()})
     hand.page.wait_for_function(f"() => ({CANVAS}).state.light >= 2")
     other.page.mouse.move(60, 60)
     root = "document.querySelector('#viewer').shadowRoot"

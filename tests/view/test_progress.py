@@ -320,11 +320,7 @@ def test_the_page_opens_a_scene_that_is_dropped_with_a_camera_of_its_own(browser
     server = Server(empty)
     hand = Hand(browser, server.url)
     hand.drag((100, 100), (140, 120))
-    drop = f"""() => {{ const data = new DataTransfer();
-        for (const name of ["a.obj", "a.mtl"]) data.items.add(new File(["text"], name));
-        const fields = {{ dataTransfer: data, bubbles: true, composed: true }};
-        ({CANVAS}).dispatchEvent(new DragEvent("drop", fields)); }}"""
-    hand.page.evaluate(drop)
+    hand.drop({"a.obj": b"text", "a.mtl": b"text"})
     hand.page.wait_for_function(
         f"() => Math.abs(({CANVAS}).camera().distance - {np.hypot(np.hypot(1.0, 0.75), 2.0)}) < 1e-4"
     )

@@ -34,15 +34,6 @@ def wait_for_history(hand):
     hand.page.wait_for_timeout(1000 * SETTLED)
 
 
-def drop(hand, name, text):
-    hand.page.evaluate(
-        f"""([name, text]) => {{ const data = new DataTransfer(); data.items.add(new File([text], name));
-            const fields = {{ dataTransfer: data, bubbles: true, composed: true }};
-            ({CANVAS}).dispatchEvent(new DragEvent("drop", fields)); }}""",
-        [name, text],
-    )
-
-
 def test_every_change_is_taken_back_and_done_again(hand):
     changes = {
         "a drag": lambda: hand.drag((100, 100), (140, 120)),
@@ -144,12 +135,12 @@ def test_the_address_holds_the_state_and_a_file_shows_it_again(browser, server, 
     close_to(other.camera(), camera)
     other.page.keyboard.press("r")
     wait_for_history(other)
-    drop(other, "kept.json", text)
+    other.drop({"kept.json": text.encode()})
     wait_for_history(other)
     assert other.state() == state
     close_to(other.camera(), camera)
     strange = json.loads(text) | {"light": "moon", "materials": {"ball": {"roughness": 0.4}, "roof": {"roughness": 1}}}
-    drop(other, "kept.json", json.dumps(strange))
+    other.drop({"kept.json": json.dumps(strange).encode()})
     wait_for_history(other)
     assert other.page.evaluate(f"() => {TOLD}") == "the scene lacks the light moon, the part roof of the state"
     assert other.state()["materials"] == {"ball": {"roughness": 0.4}}
@@ -160,7 +151,7 @@ def test_the_address_holds_the_state_and_a_file_shows_it_again(browser, server, 
         (json.dumps(strange | {"lamps": 3}), "kept.json: lamps of a state must be a list"),
         (json.dumps(strange | {"eye": [1, 2]}), "kept.json: eye of a state must be three numbers"),
     ):
-        drop(other, "kept.json", wrong)
+        other.drop({"kept.json": wrong.encode()})
         other.page.wait_for_timeout(200)
         assert other.page.evaluate(f"() => {TOLD}").startswith(words)
         assert other.state() == before

@@ -75,7 +75,7 @@ export function frameOf(shadow, on) {
   help.querySelector("button").onclick = toggleHelp;
   tool("picture", "save a picture, a video or the state", () => dialog.open());
   const [undo, redo] = [tool("undo", "undo (Z)", () => on.undo(-1)), tool("redo", "redo (Y)", () => on.undo(1))];
-  tool("frame", "show all of the part that was opened last, or of the scene (F)", on.frame);
+  tool("frame", "show all of the part that was picked last, or of the scene (F)", on.frame);
   tool("reset", "reset the view, the light, the materials and the display (R)", on.reset);
   tool("theme", "dark or light", () => theme(!frame.classList.contains("light")));
   tool("help", "help (H)", toggleHelp);

@@ -20,7 +20,7 @@ export const HELP = [
   [`drag, one finger, ${keys("← → ↑ ↓")}`, "orbit"],
   [`right drag, ${keys("Ctrl")}-drag, two fingers, ${keys("Shift")} ${keys("← → ↑ ↓")}`, "pan"],
   [`wheel, pinch, ${keys("+ -")}`, "zoom, to where the pointer is"],
-  [keys("F"), "show all of the part that was opened last, or of the scene"],
+  [keys("F"), "show all of the part that was picked last, or of the scene"],
   ["double-click, double tap", "look at a point, and open its material"],
   [`${keys("Alt")}-click`, "open the material of a part"],
   [`${keys("Shift")}-drag, ${keys("[ ]")}`, "turn the light"],

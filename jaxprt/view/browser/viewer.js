@@ -439,7 +439,7 @@ export function mount(root, ask, { addressed = false } = {}) {
     camera.widen(angle);
     moved();
   };
-  // Shows all of the part that was opened last, or of the scene.
+  // Shows all of the part that was picked last, or of the scene.
   const frameAll = () => {
     const low = [Infinity, Infinity, Infinity];
     const high = low.map((x) => -x);
@@ -467,12 +467,13 @@ export function mount(root, ask, { addressed = false } = {}) {
     moved();
     tell((notice = lacking));
   };
+  const text = () => written(state, camera, scene, canvas.width / canvas.height);
   const past = new History(
-    () => !hands.held && written(state, camera, scene, canvas.width / canvas.height),
+    () => !hands.held && text(),
     give,
-    (text) => {
+    (kept) => {
       view.steps(past.at > 0, past.at < past.states.length - 1);
-      if (addressed) history.replaceState(null, "", `#${encodeURIComponent(text)}`);
+      if (addressed) history.replaceState(null, "", `#${encodeURIComponent(kept)}`);
     },
   );
   const arrived = () => {
@@ -563,7 +564,7 @@ export function mount(root, ask, { addressed = false } = {}) {
     let vertex = scene.face[3 * triangle];
     return { point: add(origin, way, distance), part: scene.parts.find((part) => (vertex -= part.vertices) < 0) };
   };
-  let opened = ""; // the name of the part whose controls were opened last
+  let opened = ""; // the name of the part that was picked last
   const pick = (x, y) => {
     const part = seen(x, y)?.part;
     opened = part?.name ?? "";
@@ -585,8 +586,10 @@ export function mount(root, ask, { addressed = false } = {}) {
     if (!scene) throw new Error("there is no scene yet");
     const shows = { ...state, ...from.fields, background: transparent ? "none" : state.background };
     const python = scene.rests.includes("picture");
-    if (!python) drawing.gpu?.change({ ...message("look"), ...from.fields, eye: from.camera.eye });
-    if (!python) return drawn(await drawing.picture(from.camera, shows, scene.center, width, height), width, height);
+    if (!python) {
+      drawing.gpu?.change({ ...message("look"), ...from.fields, eye: from.camera.eye });
+      return drawn(await drawing.picture(from.camera, shows, scene.center, width, height), width, height);
+    }
     const over = !transparent && format === "png" && state.background !== "light";
     const asked = {
       ...message("picture"),
@@ -616,7 +619,7 @@ export function mount(root, ask, { addressed = false } = {}) {
     const { kind } = choice;
     const json = (text) => new Blob([text], { type: "application/json" });
     if (!scene) throw new Error("there is no scene yet");
-    if (kind === "state") return { blob: json(past.take()), name: "jaxprt.json" };
+    if (kind === "state") return { blob: json(text()), name: "jaxprt.json" };
     if (kind === "materials") return { blob: json(materials(scene, state.materials)), name: "materials.json" };
     if (kind === "glb") {
       const { content, buffers } = await ask(message("glb"));
