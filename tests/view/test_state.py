@@ -11,7 +11,7 @@ from PIL import Image
 
 import jaxprt as prt
 from jaxprt import image
-from jaxprt.view import Session
+from jaxprt.view import Server, Session
 from jaxprt.view.state import load_state
 from tests.view.hand import CANVAS, TOLD, Hand
 
@@ -228,12 +228,27 @@ def test_states_that_are_none_are_refused(tmp_path, systems, lights):
         load_state(file).changed(systems["lobes"].scene)
 
 
-def test_places_of_a_state_are_those_of_the_file(systems, lights):
+def test_places_of_a_state_are_those_of_the_file(browser, systems, lights, tmp_path):
     """A scene far from zero is drawn about its own origin, which the page adds again."""
-    part = systems["harmonics"].scene["ball"]
-    far = dataclasses.replace(part.mesh, origin=(1e6, 2.0, -3e5))
+    part, origin = systems["harmonics"].scene["ball"], (1e6, 2.0, -3e5)
+    far = dataclasses.replace(part.mesh, origin=origin)
     scene = prt.Scene([dataclasses.replace(part, mesh=far)])
     made = prt.precompute(scene, refine=False, system=prt.relit.Harmonics(2), size=8, progress=False)
-    content = Session(made, environments=lights).answer({"kind": "scene"}).content
-    assert content["origin"] == [1e6, 2.0, -3e5]
-    np.testing.assert_allclose(content["center"], 0, atol=1e-5)
+    server = Server(Session(made, environments=lights))
+    hand = Hand(browser, server.url)
+    hand.drag((100, 100), (140, 120))
+    wait_for_history(hand)
+    camera, state = hand.camera(), shown(hand)
+    np.testing.assert_allclose(camera["target"], 0, atol=1e-5)
+    np.testing.assert_allclose(state["target"], origin, atol=1e-3)
+    np.testing.assert_allclose(np.subtract(state["eye"], origin), camera["eye"], atol=1e-3)
+    file = tmp_path / "kept.json"
+    file.write_text(json.dumps(state))
+    np.testing.assert_allclose(load_state(file).camera(32).local(origin).eye, camera["eye"], atol=1e-3)
+    other = Hand(browser, hand.page.url)
+    wait_for_history(other)
+    np.testing.assert_allclose(other.camera()["eye"], camera["eye"], atol=1e-3)
+    for tab in (hand, other):
+        tab.page.close()
+        assert not tab.errors
+    server.close()
