@@ -9,7 +9,12 @@ _MARGIN = 4  # pixels
 
 
 def line(text: str, *, width: int, height: int) -> Float[np.ndarray, "h w 3"]:
-    """A line of black text in the middle of white, smaller or without its middle where it is too wide.
+    """Draws a line of black text in the middle of a white picture. Long text gets smaller letters, or loses its middle.
+
+    Args:
+        text: The text.
+        width: Columns of the picture in pixels.
+        height: Rows of the picture in pixels.
 
     Raises:
         OSError: The text cannot be drawn.
@@ -24,7 +29,7 @@ def line(text: str, *, width: int, height: int) -> Float[np.ndarray, "h w 3"]:
 
 
 def fitting(text: str, width: int) -> tuple[str, int]:
-    """A text that fits into a width, and the size of its letters in pixels."""
+    """A text that fits into a width in pixels, and the height of its letters in pixels."""
     for size in range(_LARGEST, _SMALLEST - 1, -1):
         if OpenImageIO.ImageBufAlgo.text_size(text, size).width <= width:
             return text, size

@@ -178,9 +178,8 @@ class _Images:
     def __init__(self, most: int):
         """Starts without images, of which none will have more than so many texels along an edge."""
         self._most = most
-        self.described: list[
-            dict[str, int]
-        ] = []  # size and number of channels of each image, and whether it is of colors
+        # Size and number of channels of each image, and whether it is of colors.
+        self.described: list[dict[str, int]] = []
         self.data: list[np.ndarray] = []  # first row on top; colors are encoded by sRGB
         self._number: dict[tuple[int, str], int] = {}
 
