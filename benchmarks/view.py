@@ -9,6 +9,10 @@ compiled ahead. `cold` has neither programs nor precomputation of earlier proces
 JAXPRT_DATA names a folder of files; then its first frame on the screen of Chromium follows, without a graphics card,
 of three starts the middle one.
 
+Then pages without Python, where JAXPRT_DATA and Chromium are there: `error` is that of what the browser draws at rest,
+nine samples a pixel, beside `RelitScene.picture`; `stated` is what the page says of itself, `judged` is the browser's
+error beside Mitsuba 3 with the original light file, and `picture` that of `RelitScene.picture`. Direct light.
+
 Then looks, for browsers whose GPU does not shade: the embedded scene by lobes, with direct light, one bounce and two.
 Each time is from the question to the last byte of the answer. `bytes` are those of an answer, whose half floats the
 error is of. The quick case has no bounce.
@@ -25,6 +29,7 @@ import sys
 import tempfile
 import time
 import urllib.parse
+import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Any
 
@@ -32,7 +37,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxprt as prt
-from benchmarks import harness
+from benchmarks import accuracy, asset_files, assets, denoised, harness
 from jaxprt import image, view
 from jaxprt.cli.inputs import example_scene
 from jaxprt.scene import TexturedMaterial, builtin
@@ -40,6 +45,15 @@ from jaxprt.scene.environment import rotate
 from jaxprt.view import messages
 
 _FOREIGN, _STARTS = "foreign/craft_speederD.gltf", 3  # and how often it is started
+# Meshes and materials of `benchmarks.accuracy`, and a file: as pages in a light.
+_PAGES = {
+    "spot, textured": "courtyard",
+    "rocker arm, plastic": "sunrise",
+    "suzanne, metal 0.15": "studio",
+    "cakeBirthday.glb": "uffizi",
+}
+_EDGE = 384  # of their pictures
+_CANVAS = "document.querySelector('#viewer')?.shadowRoot?.querySelector('.canvas')"
 _FILES = "scenes/Duck.glb", "env/uffizi_latlong_256x128.hdr"  # in JAXPRT_DATA
 
 
@@ -205,26 +219,35 @@ def preparations(*, quick: bool) -> Iterator[dict[str, Any]]:
                 process.close()
 
 
-def first_frames() -> Iterator[dict[str, Any]]:
-    """The first frame of a foreign file in a browser that is already open: cold, and with programs."""
-    data, chromium = os.environ.get("JAXPRT_DATA"), shutil.which("chromium") or shutil.which("chromium-browser")
-    if data is None or chromium is None:
+@contextlib.contextmanager
+def browsing() -> Iterator[Any]:
+    """Chromium without a graphics card; None where it or the data is not there."""
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if "JAXPRT_DATA" not in os.environ or chromium is None:
+        yield None
         return
     from playwright.sync_api import sync_playwright
 
     switches = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-    canvas = "document.querySelector('#viewer')?.shadowRoot?.querySelector('.canvas')"
-    with sync_playwright() as playwright, tempfile.TemporaryDirectory() as kept:
+    with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium, args=switches)
+        yield browser
+        browser.close()
+
+
+def first_frames(browser: Any) -> Iterator[dict[str, Any]]:
+    """The first frame of a foreign file in a browser that is already open: cold, and with programs."""
+    file = str(harness.data() / _FOREIGN)
+    with tempfile.TemporaryDirectory() as kept:
         for case in ("cold", "programs"):
             spent = []
             for _ in range(_STARTS + (case == "programs")):
                 with tempfile.TemporaryDirectory() as folder:
-                    process = Preparation([os.path.join(data, _FOREIGN)], folder if case == "cold" else kept)
+                    process = Preparation([file], folder if case == "cold" else kept)
                     page = browser.new_page(viewport={"width": 1100, "height": 700})
                     page.goto(process.url)
                     page.wait_for_function(
-                        f"() => {canvas}?.stats?.draws > 0 && {canvas}.pixels?.()?.message", polling=50
+                        f"() => {_CANVAS}?.stats?.draws > 0 && {_CANVAS}.pixels?.()?.message", polling=50
                     )
                     page.screenshot()  # waits for the renderer
                     spent.append(time.perf_counter() - process.began)
@@ -240,15 +263,81 @@ def first_frames() -> Iterator[dict[str, Any]]:
                 "error": None,
                 "bytes": 0,
             }
-        browser.close()
+
+
+def pages(browser: Any, folder: pathlib.Path | None) -> Iterator[dict[str, Any]]:
+    """What a browser draws of exported pages. Pictures are written into a folder: the browser's, ours, Mitsuba's."""
+    for name, light_name in _PAGES.items():
+        path = harness.data() / "env" / accuracy.LIGHTS[light_name]
+        subject = _subject(name)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of negative pixels of lights
+            light = prt.load_environment(path)
+            relit = prt.precompute(subject.scene, system="lobe", progress=False).centered()
+            with tempfile.TemporaryDirectory() as temporary:
+                piece = view.export(relit, f"{temporary}/page.html", environments={light_name: light})
+                drawn, seconds = _drawn(browser, piece.path)
+        height, width = drawn.shape[:2]
+        camera = dataclasses.replace(relit.camera, width=width, height=height)
+        picture = np.asarray(relit.picture(light, camera, background=None))
+        camera = dataclasses.replace(subject.camera, width=width, height=height)
+        request = {"camera": camera, "samples": accuracy.SAMPLES, "model": "gltf", "bounces": 0}
+        total, blocks, sides = assets.rendered(subject.surfaces, path, request, picture, None)
+        halves = np.where(sides[1][..., None], 0, total / blocks)
+        truth = denoised.Truth(halves, 2 * blocks * accuracy.SAMPLES)
+        inside = truth.inside & (drawn[..., 3] > 0.999)
+        if folder is not None:
+            sheets = [assets.sheet(shown, halves.mean(0), truth.inside)[0] for shown in (drawn[..., :3], picture)]
+            assets.write(folder / f"{name.replace(', ', '_').replace(' ', '-')}.png", np.concatenate(sheets))
+        yield {
+            "benchmark": "view",
+            "case": f"page: {name}, {light_name}",
+            "seconds": seconds,
+            "compile_seconds": 0.0,
+            "error": float(image.relative_l2(drawn[inside][:, :3], picture[inside])),
+            "bytes": piece.nbytes,
+            "stated": piece.error,
+            "judged": truth.error(drawn[..., :3]),
+            "picture": truth.error(picture),
+        }
+
+
+def _subject(name: str) -> accuracy.Subject:
+    """A mesh and a material of the table of errors, or a file, with its camera."""
+    if ", " in name:
+        subject = accuracy.subject_of(*name.split(", "), edge=_EDGE)
+        scene = dataclasses.replace(subject.scene, cameras=[subject.camera])
+        return subject._replace(scene=scene)
+    path = harness.data() / "foreign" / name
+    scene = prt.load_scene(path)
+    return accuracy.Subject(scene, asset_files.read(path), scene.camera)
+
+
+def _drawn(browser: Any, path: pathlib.Path) -> tuple[np.ndarray, float]:
+    """Radiance and coverage of the picture at rest of a page, and seconds until it was there."""
+    page = browser.new_page(viewport={"width": _EDGE + 264, "height": _EDGE})
+    began = time.perf_counter()
+    page.goto(path.as_uri())
+    page.wait_for_function(f"() => {_CANVAS}?.pixels?.()?.stats.samples === 9", timeout=300_000)
+    seconds = time.perf_counter() - began
+    found = page.evaluate(
+        f"() => {{ const r = {_CANVAS}.pixels().read(); return {{ ...r, data: Array.from(r.data) }}; }}"
+    )
+    page.close()
+    return np.reshape(found["data"], (found["height"], found["width"], 4))[::-1], seconds
 
 
 def main(options: Sequence[str] | None = None) -> None:
-    arguments = harness.parser(str(__doc__).splitlines()[0]).parse_args(options)
+    parser = harness.parser(str(__doc__).splitlines()[0])
+    parser.add_argument("--pictures", type=pathlib.Path, metavar="FOLDER", help="write pictures of pages beside others")
+    arguments = parser.parse_args(options)
     for line in preparations(quick=arguments.quick):
         harness.report(line, arguments.output)
-    for line in () if arguments.quick else first_frames():
-        harness.report(line, arguments.output)
+    with browsing() as browser:
+        for line in () if arguments.quick or browser is None else first_frames(browser):
+            harness.report(line, arguments.output)
+        for line in () if arguments.quick or browser is None else pages(browser, arguments.pictures):
+            harness.report(line, arguments.output)
     for bounces in (0,) if arguments.quick else (0, 1, 2):
         for line in hands(bounces, quick=arguments.quick):
             harness.report(line, arguments.output)

@@ -50,6 +50,7 @@ def page_content(page: PageScene, lights: Sequence[Environment]) -> tuple[JsonOb
     blurring = blur_parameters(size) if size else NO_SCALES
     rims = sorted({mips[0], *blurring["edges"], *content["edges"]}, reverse=True)
     content |= {"light": blurring, "mips": mips, "rims": rims, "lights": len(lights), "glossy": bool(size)}
+    content |= {"finer": _finer(size)}
     arrays += [cubemap.border_index(size=edge).astype("<u4").tobytes() for edge in rims]
     return content, arrays + [light_texels(light, mips[0]) for light in lights]
 
@@ -277,6 +278,16 @@ def blur_parameters(size: int) -> JsonObject:
         "concentrations": concentration,
         "reaches": [min(np.pi, blurred_light.REACH * np.sqrt(variance)) for variance in variances],
     }
+
+
+def _finer(size: int) -> JsonObject:
+    """Scales of the texels that the page makes of the picture of a light, for very narrow lobes."""
+    if not size:
+        return {"edges": [], "spreads": [], "starts": [], "total": 0}
+    before = blurred_light.scales(size)
+    scale, count = blurred_light.finer_scales(size, before=before.total), -len(before.edge)
+    edge, start, spread = (values[:count].tolist() for values in (scale.edge, scale.start, scale.spread))
+    return {"edges": edge, "spreads": spread, "starts": start, "total": scale.total - before.total}
 
 
 def _family(shading: Shading) -> dict[str, list]:

@@ -32,7 +32,7 @@ _RAW = 128  # texels along an edge up to which images are no files
 _MOST_EXACT = 1 << 23  # bytes of exact files of images, above which those of colors are not exact
 _QUALITY = 92  # of files of colors, from 0 to 100
 _SPARE = 64  # bytes by which the page's size may change when another error is written into it
-_SMOOTHEST = 0.25  # least roughness that users of a page can choose: smoother materials vary over a bright texel
+_SMOOTHEST = 0.05  # least roughness that users of a page can choose: smoother materials vary over a texel of 256
 # The page loads nothing, and runs its own script alone.
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8">

@@ -16,7 +16,7 @@ from jaxprt.relit.build import shaded as shaded_parts
 from jaxprt.relit.groups import Layout
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Camera, Environment, Part, Scene, Texture, TexturedMaterial, builtin
-from jaxprt.scene.environment import rotate
+from jaxprt.scene.environment import environment_from_image, rotate
 from jaxprt.view import Server, Session, messages, stages
 from jaxprt.view import browser as modules
 from jaxprt.view.content import page_content
@@ -32,14 +32,19 @@ SAVED = 0.015  # between pictures of nine samples and of one
 LINE = "document.querySelector('#viewer').shadowRoot.querySelector('.line').textContent"
 UNSHADOWED = 0.05  # of the mean, for the horizon and the irradiance that are blurred
 
-SHADES = """async ({ module, data, message, angle, radius, backs, size }) => {
-  const { Camera, Piece, Pixels, unpack } = await import(module);
+SHADES = """async ({ module, data, sky, message, angle, radius, backs, size }) => {
+  const { Camera, Drawing, Piece, Pixels, unpack } = await import(module);
   const bytes = Uint8Array.from(atob(data), (each) => each.charCodeAt(0));
   const { content, buffers } = unpack(bytes.buffer), canvas = document.createElement("canvas");
   Object.assign(canvas, size);
-  const gl = canvas.getContext("webgl2"), piece = new Piece(content, buffers);
+  const drawing = new Drawing(canvas), { gl } = drawing, piece = new Piece(content, buffers);
   await piece.expand();
   const pixels = new Pixels(gl, piece, backs);
+  if (sky) {
+    const half = new Uint16Array(Uint8Array.from(atob(sky.data), (byte) => byte.charCodeAt(0)).buffer);
+    drawing.setSky(half, sky.content, JSON.stringify([message.light, message.lamps]));
+    pixels.see(drawing.seen);
+  }
   const camera = new Camera({ eye: message.eye, target: message.target, radius, field_of_view: angle });
   const matrix = camera.matrix(size.width / size.height, [0, 0, 0]);
   pixels.change({ ...message, field_of_view: angle });
@@ -94,7 +99,7 @@ def shaded(browser):
     tab = browser.new_page()
     module = "data:text/javascript;base64," + base64.b64encode(modules.module().encode()).decode()
 
-    def shade(page, mesh, lights, camera, **changes):
+    def shade(page, mesh, lights, camera, sky=None, **changes):
         content, arrays = page_content(page, lights)
         face = stages.counterclockwise(mesh)
         places = np.asarray(mesh.position, "<f4").tobytes(), face.tobytes()
@@ -103,13 +108,15 @@ def shaded(browser):
         message |= {"eye": np.asarray(camera.eye, float).tolist(), "target": np.asarray(camera.target, float).tolist()}
         size = {"width": camera.width, "height": camera.height}
         asked = {"module": module, "data": data, "message": message, "angle": float(camera.field_of_view)}
+        if sky is not None:
+            asked["sky"] = {"content": sky.content, "data": base64.b64encode(sky.buffers[0]).decode()}
         result = tab.evaluate(SHADES, asked | {"radius": 5.0, "backs": 3 * len(face), "size": size})
         assert result["error"] == 0
         assert result["slow"]  # frames of three seconds are left to Python
         shape = camera.height, camera.width, 4
         names = "data", "saved", "first"
         image, saved, first = (result[name] and np.reshape(result[name], shape)[::-1] for name in names)
-        if first is not None:  # pixels of 8 x 8, with edges of surfaces as fine as at rest
+        if first is not None and sky is None:  # pixels of 8 x 8, with edges of surfaces as fine as at rest
             assert result["edge"] == 8
             assert np.abs(first[..., 3] - image[..., 3]).mean() < 0.01
             assert np.abs(first - image)[..., :3].mean() < COARSE * image[..., :3].mean()
@@ -217,6 +224,27 @@ def test_pixels_of_the_browser_are_those_of_python(case, shaded):
     assert np.mean(same) > 0.3
     off = np.abs(found[..., :3] - true)[same]
     assert off.mean() < SAME * true[same].mean()
+
+
+def test_smooth_metals_show_the_picture_of_a_light(shaded):
+    """By texels a fourth as large as the light's, without what its brightest texels are summed for one by one."""
+    rows = np.full((256, 512, 3), 0.2)
+    rows[:, (np.arange(512) // 16) % 2 == 0] = [0.8, 0.5, 0.2]  # stripes of half a texel
+    rows[60:90, 60:90] = 40.0
+    light = environment_from_image(rows, size=SIZE)
+    scene = scene_of(dataclasses.replace(METAL, roughness=0.05), MATTE)
+    recipe = prt.relit.Lobes(8, texels=2)
+    relit = prt.precompute(scene, refine=False, system=recipe, size=SIZE, progress=False)
+    page, sky = PageScene.for_gpu(relit), Session(relit, environments={"light": light}).sky(0, rows=256)
+    true, coarse = (
+        np.asarray(page.relit().picture(shown, CAMERA, samples=1, shadows="vertices"))
+        for shown in (light, Environment(light.radiance))
+    )
+    found = shaded(page, relit.mesh, [light], CAMERA, sky=sky)[..., :3]
+    ball = np.asarray(relit.picture(light, CAMERA, samples=1, layers=("part",))["part"]) == 0
+    off, without = (np.abs(image - true)[inside(ball)].mean() / true[inside(ball)].mean() for image in (found, coarse))
+    assert off < 0.04
+    assert without > 3 * off
 
 
 def test_every_browser_has_as_many_textures_as_the_shader_of_pixels_reads():

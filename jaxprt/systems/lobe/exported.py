@@ -17,7 +17,7 @@ from jaxprt.systems.lobe.table import LobeBrdf
 from jaxprt.systems.protocol import CHANNELS, Exported, System
 
 DEGREE = 6  # of the harmonics by which pages light diffuse parts
-_LIGHT = 32  # most texels along a face's edge of the light that lobes read
+_LIGHT = 64  # most texels along a face's edge of the light that lobes read
 
 
 class CoarseTransport(LobeTransport):

@@ -111,7 +111,7 @@ export class Drawing {
     this.position = gl.createBuffer();
     this.color = gl.createBuffer();
     this.index = gl.createBuffer();
-    this.skyImage = this.blurredImage = null;
+    this.skyImage = this.blurredImage = this.seen = null;
     this.gpu?.build();
     this.stills = []; // pictures at rest: the last one appears over the one before
   }
@@ -163,8 +163,8 @@ export class Drawing {
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
     return handle;
   }
-  setSky(data, { width, height, scale, levels = 1 }) {
-    // levels: pictures of half the size follow, as mip maps
+  setSky(data, { width, height, scale, levels = 1 }, of) {
+    // levels: pictures of half the size follow, as mip maps; of: the light and lamps, as `Piece` calls them
     const gl = this.gl;
     if (this.skyImage) gl.deleteTexture(this.skyImage);
     this.skyImage = this.texture(data, width, height, false, true);
@@ -185,6 +185,7 @@ export class Drawing {
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, levels - 1);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
     [this.skyScale, this.skyHeight] = [scale, height];
+    this.seen = { image: this.skyImage, scale, height, of };
     // The last and smallest of the pictures is what is blurred.
     const [w, h] = [width >> (levels - 1), height >> (levels - 1)];
     if (this.blurredImage) gl.deleteTexture(this.blurredImage);
@@ -292,6 +293,7 @@ export class Drawing {
       this.late ||= fresh;
       return true;
     }
+    gpu?.see(this.seen);
     const more = gpu?.work(now, camera.matrix(width / height, center), width, height, python) ?? false;
     if (more && !fresh && !this.late && !gpu.fresh && !this.stills.length) return true;
     this.late = false;

@@ -1,6 +1,6 @@
 // Cubemaps of lights: texels, mip maps, blurring, and files.
 
-import { WIDTH } from "./shading.js";
+import { dot } from "./common.js";
 
 export const toHalf = (() => {
   const float = new Float32Array(1);
@@ -109,7 +109,8 @@ export function rimmed(light, edge, index, result, start) {
         }
 }
 
-// Blurs a light to all widths, as `jaxprt.lobe.prefilter` does; which texels each takes, and how much, is made once.
+// Blurs a light to all widths, as `jaxprt.lobe.prefilter` does; which texels each takes, and how much, is found once,
+// for a quarter of the first face: all others take those that lie to them as these do to it.
 const blurs = new Map();
 export class Blur {
   static of(scale, index) {
@@ -120,6 +121,7 @@ export class Blur {
   constructor(scale, index) {
     this.scale = scale;
     this.index = index;
+    this.quarters = new Map(scale.sources.map((edge) => [edge, quarters(edge)]));
     this.levels = scale.edges.map((edge, i) =>
       i ? this.taps(edge, scale.sources[i], scale.concentrations[i], scale.reaches[i]) : null,
     );
@@ -137,43 +139,85 @@ export class Blur {
     const wide = reach + (1.5 * parts) / source;
     const nearest = wide < Math.PI ? Math.cos(wide) : -1;
     const members = Array.from({ length: blocks.length / 3 }, () => []);
-    const dot = (a, i, b, j) => a[3 * i] * b[3 * j] + a[3 * i + 1] * b[3 * j + 1] + a[3 * i + 2] * b[3 * j + 2];
+    const near = (a, i, b, j) => a[3 * i] * b[3 * j] + a[3 * i + 1] * b[3 * j + 1] + a[3 * i + 2] * b[3 * j + 2];
     area.forEach((_, j) => members[whole(j, source / parts, parts)].push(j));
-    for (let i = 0; i < 6 * edge * edge; i++) {
+    for (let n = 0; n < (edge * edge) / 4; n++) {
+      const i = 2 * n - (n % (edge / 2));
       let total = 0;
       for (let block = 0; block < members.length; block++) {
-        if (dot(to, i, blocks, block) < nearest) continue;
+        if (near(to, i, blocks, block) < nearest) continue;
         for (const j of members[block]) {
-          const cosine = dot(to, i, way, j);
+          const cosine = near(to, i, way, j);
           if (cosine < least) continue;
-          const each = area[j] * Math.exp(concentration * (cosine - 1));
+          const share = area[j] * Math.exp(concentration * (cosine - 1));
           index.push(j);
-          weight.push(each);
-          total += each;
+          weight.push(share);
+          total += share;
         }
       }
-      for (let k = from[i]; k < index.length; k++) weight[k] /= total;
+      for (let k = from[n]; k < index.length; k++) weight[k] /= total;
       from.push(index.length);
     }
     return { from: Uint32Array.from(from), index: Uint16Array.from(index), weight: Float32Array.from(weight) };
   }
   apply(mips) {
     const { edges, starts, sources, total } = this.scale;
-    const result = new Float32Array(4 * WIDTH * Math.ceil(total / WIDTH));
+    const result = new Float32Array(4 * total);
     edges.forEach((edge, n) => {
       let value = mips.get(edge);
       if (n) {
         const { from, index, weight } = this.levels[n];
         const source = mips.get(sources[n]);
         value = new Float32Array(18 * edge * edge);
-        for (let i = 0; i < 6 * edge * edge; i++)
-          for (let k = from[i]; k < from[i + 1]; k++)
-            for (let c = 0; c < 3; c++) value[3 * i + c] += weight[k] * source[3 * index[k] + c];
+        const half = edge / 2;
+        for (const { face, right, down, texel } of this.quarters.get(sources[n]))
+          for (let i = 0; i < half * half; i++) {
+            const row = Math.floor(i / half);
+            const column = i % half;
+            const to = (face * edge + (down ? edge - 1 - row : row)) * edge + (right ? edge - 1 - column : column);
+            let [r, g, b] = [0, 0, 0];
+            for (let k = from[i]; k < from[i + 1]; k++) {
+              const j = 3 * texel[index[k]];
+              r += weight[k] * source[j];
+              g += weight[k] * source[j + 1];
+              b += weight[k] * source[j + 2];
+            }
+            value.set([r, g, b], 3 * to);
+          }
       }
       rimmed(value, edge, this.index.get(edge), result, starts[n]);
     });
     return result;
   }
+}
+
+// For each quarter of each face, the texels that lie to it as all texels do to the first quarter of the first face. Within
+// a face they follow one another in steps.
+function quarters(edge) {
+  const { way } = grid(edge);
+  const place = (x) => Math.floor(((x + 1) / 2) * edge);
+  const turned = (i, face, right, down) => {
+    const [s, t, n] = SIDES[0].map((axis) => dot(axis, way.subarray(3 * i, 3 * i + 3)));
+    const [S, T, N] = SIDES[face];
+    const d = N.map((x, c) => n * x + (right ? -s : s) * S[c] + (down ? -t : t) * T[c]);
+    const forward = d.reduce((a, x, c) => (Math.abs(x) > Math.abs(d[a]) ? c : a), 0);
+    const to = 2 * forward + (d[forward] < 0 ? 1 : 0);
+    const [u, v, w] = SIDES[to].map((axis) => dot(axis, d));
+    return (to * edge + place(v / w)) * edge + place(u / w);
+  };
+  return SIDES.flatMap((_, face) =>
+    [0, 1, 2, 3].map((quarter) => {
+      const [right, down] = [quarter & 1, quarter >> 1];
+      const texel = new Uint16Array(6 * edge * edge);
+      for (let start = 0; start < texel.length; start += edge * edge) {
+        const [first, next, below] = [start, start + 1, start + edge].map((i) => turned(i, face, right, down));
+        for (let row = 0, i = start; row < edge; row++)
+          for (let column = 0; column < edge; column++)
+            texel[i++] = first + column * (next - first) + row * (below - first);
+      }
+      return { face, right, down, texel };
+    }),
+  );
 }
 
 // Radiance HDR: lines of RGBE, plain or by runs of either kind, from the top left. Pixels divided by the exposures

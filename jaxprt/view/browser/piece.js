@@ -4,7 +4,7 @@
 // them once.
 
 import { floats, pause } from "./common.js";
-import { ARRIVE, GATHER, SHADE, SIGHT, WHOLE, WIDTH } from "./shading.js";
+import { ARRIVE, FINER, GATHER, SHADE, SIGHT, WHOLE, WIDTH } from "./shading.js";
 import { gathered, harmonics } from "./harmonics.js";
 import { Blur, grid, halved, whole } from "./lights.js";
 
@@ -19,6 +19,7 @@ export class Piece {
     this.content = content;
     this.buffers = buffers;
     this.blur = this.expanding = this.decoding = null;
+    this.sky = null; // a fine picture of a light: its image, scale, height, and the light and lamps that it shows
     const next = (() => {
       let i = 0;
       return (kind) => {
@@ -94,6 +95,7 @@ export class Piece {
     this.texture("visible", gl.RGBA8I, gl.RGBA_INTEGER, gl.BYTE, this.visible, 4);
     this.texture("reflected", gl.RGBA8I, gl.RGBA_INTEGER, gl.BYTE, this.reflected, 4);
     for (const name of ["light", "bright", "gathered"]) this.texture(name, gl.RGBA32F, gl.RGBA, gl.FLOAT, none, 4);
+    this.texture("share", gl.R32F, gl.RED, gl.FLOAT, none, 1);
     this.sights = Math.ceil(content.texels / 16) || 1;
     const shadows = content.visibility;
     this.arriving = this.target("arriving", shadows ? this.count : 0);
@@ -111,7 +113,7 @@ export class Piece {
       TERMS: content.terms,
       REFLECTIONS: content.reflectedUnit.length,
       LEVELS: content.edges.length,
-      WIDTHS: content.light.edges.length,
+      WIDTHS: content.finer.edges.length + content.light.edges.length,
       STRIDE: content.stride,
       TEXELS: Math.max(content.texelEdge, 4),
     };
@@ -126,19 +128,20 @@ export class Piece {
       arrive: sized(ARRIVE),
       sight: sized(SIGHT),
       gather: GATHER,
+      finer: FINER,
     };
     for (const [name, text] of Object.entries(this.programs)) this.programs[name] = this.link(WHOLE, text);
     const lists = {
       edges: content.edges,
       starts: content.starts,
-      lightEdges: content.light.edges,
-      lightStarts: content.light.starts,
+      lightEdges: [...content.finer.edges, ...content.light.edges],
+      lightStarts: [...content.finer.starts, ...content.light.starts],
     };
     for (const program of [this.programs.vertex, this.programs.pixel]) {
       gl.useProgram(program);
       for (const [name, list] of Object.entries(lists)) gl.uniform1iv(this.at(name, program), list);
       gl.uniform1fv(this.at("spreads", program), content.spreads);
-      gl.uniform1fv(this.at("lightSpreads", program), content.light.spreads);
+      gl.uniform1fv(this.at("lightSpreads", program), [...content.finer.spreads, ...content.light.spreads]);
     }
     // The last row of reflections is the light of lamps, which no environment changes.
     this.degree =
@@ -159,6 +162,7 @@ export class Piece {
       TEXTURES.forEach((name, i) => gl.uniform1i(this.at(`${name}Image`, program), this.sampling[i]));
     }
     this.lit = this.turned = ""; // the light of the moment, and its turn
+    this.fine = null; // the picture that finer texels are of
     this.colored = null; // the message that vertices have colors of
   }
   // The image of a texture, with mip maps.
@@ -270,12 +274,13 @@ export class Piece {
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     return held;
   }
-  texture(name, internal, format, type, data, channels) {
+  // A texture of some entries, or of more, of which the first ones are written.
+  texture(name, internal, format, type, data, channels, room = data.length / channels) {
     const gl = this.gl;
     const entries = data.length / channels;
     const full = Math.floor(entries / WIDTH);
     const rest = entries - full * WIDTH;
-    this.allocate(name, internal, entries);
+    this.allocate(name, internal, room);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     if (full)
       gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, full, format, type, data.subarray(0, full * WIDTH * channels));
@@ -355,10 +360,13 @@ export class Piece {
       }
       if (content.glossy) {
         this.blur ??= Blur.of(content.light, this.index);
-        this.texture("light", gl.RGBA32F, gl.RGBA, gl.FLOAT, this.blur.apply(this.mips), 4);
+        const blurred = this.blur.apply(this.mips);
+        this.texture("light", gl.RGBA32F, gl.RGBA, gl.FLOAT, blurred, 4, blurred.length / 4 + content.finer.total);
       }
-      [this.lit, this.turned] = [key, ""];
+      [this.lit, this.turned, this.fine] = [key, "", null];
+      this.sharpen();
     }
+    if (this.fine !== this.sky) this.sharpen();
     if (this.turned === `${key} ${message.turn}`) return;
     this.turned = `${key} ${message.turn}`;
     const c = Math.cos(message.turn);
@@ -398,6 +406,37 @@ export class Piece {
     this.arrive(all);
     this.finish();
   }
+  // What narrow lobes see: texels that are finer than those of the light, where there is a fine picture of it.
+  sharpen() {
+    const { gl, content, programs, sky } = this;
+    const { edges, starts } = content.finer;
+    const size = content.light.edges[0];
+    this.fine = sky;
+    const has =
+      content.glossy && sky?.of === this.lit && sky.height > 2 * size && gl.getExtension("EXT_color_buffer_float");
+    if (has) {
+      const { light } = this.textures;
+      const { finer } = programs;
+      if (!light.frame) {
+        gl.bindFramebuffer(gl.FRAMEBUFFER, (light.frame = gl.createFramebuffer()));
+        gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, light.handle, 0);
+      }
+      this.use(finer, light);
+      gl.activeTexture(gl.TEXTURE0);
+      gl.bindTexture(gl.TEXTURE_2D, sky.image);
+      gl.uniform1f(this.at("scale", finer), sky.scale);
+      edges.forEach((edge, i) => {
+        gl.uniform1f(this.at("level", finer), Math.max(Math.log2(sky.height / (2 * edge)), 0));
+        this.ints(finer, { sky: 0, edge, start: starts[i], coarse: content.mips[0] });
+        this.over(starts[i], 6 * (edge + 2) ** 2);
+      });
+      this.finish();
+    }
+    for (const program of [programs.vertex, programs.pixel]) {
+      gl.useProgram(program);
+      gl.uniform1i(this.at("finest", program), has ? 0 : edges.length);
+    }
+  }
   // Harmonics of a light that is turned.
   project(light, edge, c, s) {
     const parts = Math.max(1, Math.floor(32 / edge));
@@ -435,22 +474,25 @@ export class Piece {
     const edge = content.mips[0];
     const { way, area } = grid(edge);
     const count = content.texels;
+    const left = new Float32Array(area.length).fill(1);
     this.texels = 0; // those that stand out
-    if (!count) return light;
-    const flux = area.map((each, i) => each * (light[3 * i] + light[3 * i + 1] + light[3 * i + 2]));
-    const order = Array.from(flux.keys()).sort((a, b) => flux[b] - flux[a]);
+    const flux = area.map((x, i) => x * (light[3 * i] + light[3 * i + 1] + light[3 * i + 2]));
+    const order = count ? Array.from(flux.keys()).sort((a, b) => flux[b] - flux[a]) : [];
     const rest = light.slice();
     const data = new Float32Array(8 * count);
     for (let n = 0; n < count; n++) {
       const i = order[n];
       const share = flux[i] > 0 ? Math.max(1 - flux[order[count]] / flux[i], 0) : 0;
       if (share > 0) this.texels = n + 1;
+      left[i] -= share;
       for (let c = 0; c < 3; c++) {
         data[8 * n + c] = way[3 * i + c];
         data[8 * n + 4 + c] = share * light[3 * i + c] * area[i] * (1 - area[i] / (4 * Math.PI)); // as a disk of its solid angle has
         rest[3 * i + c] -= share * light[3 * i + c];
       }
     }
+    this.texture("share", gl.R32F, gl.RED, gl.FLOAT, left, 1);
+    if (!count) return light;
     this.texture("bright", gl.RGBA32F, gl.RGBA, gl.FLOAT, data, 4);
     return rest;
   }

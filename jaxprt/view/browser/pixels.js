@@ -174,6 +174,13 @@ export class Pixels {
     this.stale = true;
     this.stats.samples = 0;
   }
+  // A picture of the light, which smooth metals show.
+  see(sky) {
+    const { piece } = this;
+    if (piece.sky === sky) return;
+    piece.sky = sky;
+    if (piece.content.glossy && this.message) this.change(this.message);
+  }
   // Whether the GPU is still at what it was given.
   get busy() {
     return this.held || this.working;

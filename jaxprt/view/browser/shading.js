@@ -34,6 +34,7 @@ uniform int first, count, lobes, channels, nodes, knots, tableStart, weightStart
 uniform float knot[KNOTS], scale[4], logRoughness, steps;
 uniform int edges[LEVELS], starts[LEVELS], lightEdges[WIDTHS], lightStarts[WIDTHS];
 uniform float spreads[LEVELS], lightSpreads[WIDTHS];
+uniform int finest; // of the blurred lights that there are
 uniform sampler2D coordinates, base_colorImage, roughnessImage, metallicImage, emissiveImage, normalImage;
 uniform int sampled, sets[5]; // which textures there are, and the coordinates and transform of each
 uniform vec3 across[5], upward[5], baseColor, f0, emissive; uniform vec4 factors; // specular, metallic, roughness, and what is left of diffuse light where light passes
@@ -95,10 +96,10 @@ vec3 visibility(int face, float s, float t, float spread) {
 }
 vec3 radiance(vec3 d, float spread) {
   d = vec3(turn.x * d.x - turn.y * d.z, d.y, turn.y * d.x + turn.x * d.z);
-  int face, number = 0;
+  int face, number = finest;
   float s, t;
   project(d, face, s, t);
-  for (int i = 1; i < WIDTHS - 1; i++) if (spread >= lightSpreads[i]) number = i;
+  for (int i = 1; i < WIDTHS - 1; i++) if (i > finest && spread >= lightSpreads[i]) number = i;
   float upper = clamp((spread - lightSpreads[number]) / (lightSpreads[number + 1] - lightSpreads[number]), 0., 1.);
   vec3 result = vec3(0);
   for (int step = 0; step < 2; step++) {
@@ -184,6 +185,11 @@ vec4 family(vec3 wi, vec3 wo, vec3 normal, float rough) {
   vec4 result = vec4(0);
   for (int k = 0; k < 4; k++) if (k < families) result[k] = scale[k] * (term[k] == 0 ? (1. - schlick) / 3.14159265 : term[k] == 3 ? 1. / 3.14159265 : term[k] == 2 || term[k] == 6 ? lobe * schlick : lobe);
   return result;
+}
+// Log roughness with which the middle of a texel reflects as its square does on average.
+float widened(float rough) {
+  float power = term[0] == 3 && families > 1 ? 2. : 4., square = 4. * 3.14159265 / (6. * float(TEXELS * TEXELS));
+  return log(exp(power * rough) + square / 24.) / power; // see WidenedFamily in jaxprt/view/reduced.py
 }
 vec4 entry(int number, int node, int which) { // a table's entries: for each lobe its mean and log concentration, and its weights
   return texelFetch(table, at(tableStart + (number * nodes + node) * entries + which), 0);
@@ -350,11 +356,12 @@ vec3 shade() {
       }
     }
   }
+  float wide = widened(rough);
   for (int i = 0; i < texels; i++) {
     vec3 d = texelDirection(i);
     float cosine = dot(d, normal);
     if (cosine <= 0.) continue;
-    vec4 value = families > 0 ? family(d, wo, normal, rough) : diffuse / 3.14159265;
+    vec4 value = families > 0 ? family(d, wo, normal, wide) : diffuse / 3.14159265;
     color += (value.x * w[0] + value.y * w[1] + value.z * w[2] + value.w * w[3]) * cosine * clear(i) * texelFetch(bright, at(2 * i + 1), 0).rgb;
   }
   color += diffuseLight() * (diffuse.x * w[0] + diffuse.y * w[1] + diffuse.z * w[2] + diffuse.w * w[3]);
@@ -442,6 +449,23 @@ void main() {
   uvec4 bytes = uvec4(0);
   for (int k = 0; k < 16; k++) if (from + k < texels) bytes[k / 4] |= uint(255. * clear(id - first, texelDirection(from + k)) + .5) << (8 * (k & 3));
   o = bytes;
+}`;
+// Texels that are finer than those of the light, from its picture. What was taken out of a texel is missing in its finer
+// ones in the same share.
+export const FINER = `#version 300 es
+precision highp float; precision highp int; precision highp sampler2D;
+uniform sampler2D sky, share; uniform float scale, level; uniform int edge, start, coarse;
+out vec4 o;
+${AT} ${CUBE}
+void main() {
+  int m = edge + 2, i = int(gl_FragCoord.x) + ${WIDTH} * int(gl_FragCoord.y) - start;
+  if (i < 0 || i >= 6 * m * m) discard;
+  vec2 part = (vec2(i % m, i / m % m) - .5) / float(edge), place = 2. * part - 1.;
+  vec3 d = normalize(unproject(i / (m * m), place.x, place.y));
+  ivec2 texel = clamp(ivec2(part * float(coarse)), 0, coarse - 1);
+  float left = texelFetch(share, at((i / (m * m) * coarse + texel.y) * coarse + texel.x), 0).r;
+  vec3 color = textureLod(sky, vec2(.5 - atan(d.x, d.z) / 6.28318531, acos(clamp(d.y, -1., 1.)) / 3.14159265), level).rgb;
+  o = vec4(left * scale * color, 0);
 }`;
 // The harmonics of the light that arrives at a vertex, two at a time: those of its visibility times the light's table.
 export const GATHER = `#version 300 es

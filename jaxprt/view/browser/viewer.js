@@ -300,7 +300,7 @@ export function mount(root, ask, { addressed = false } = {}) {
       const data = new Uint16Array(buffers[0].buffer, buffers[0].byteOffset, buffers[0].byteLength / 2);
       if (rows === 1) controls?.paint(data, content);
       if (skyKey.rows !== rows) return; // the fine one has been asked for
-      drawing.setSky(data, content);
+      drawing.setSky(data, content, key);
       stats.sky = content.height;
       redraw();
     } catch {
