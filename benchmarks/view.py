@@ -279,7 +279,7 @@ def pages(browser: Any, folder: pathlib.Path | None) -> Iterator[dict[str, Any]]
                 drawn, seconds = _drawn(browser, piece.path)
         height, width = drawn.shape[:2]
         camera = dataclasses.replace(relit.camera, width=width, height=height)
-        picture = np.asarray(relit.picture(light, camera, background=None))
+        picture = np.asarray(relit.picture(light, camera, background=None))[..., :3]
         camera = dataclasses.replace(subject.camera, width=width, height=height)
         request = {"camera": camera, "samples": accuracy.SAMPLES, "model": "gltf", "bounces": 0}
         total, blocks, sides = assets.rendered(subject.surfaces, path, request, picture, None)
