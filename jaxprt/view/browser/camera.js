@@ -1,4 +1,4 @@
-// The camera, and where a ray through a pixel meets the mesh.
+// The camera.
 
 import { add, clamp, cross, dot, unit } from "./common.js";
 
@@ -92,42 +92,4 @@ export class Camera {
     result[15] = dot(z, e);
     return result;
   }
-}
-
-// Where a ray meets the mesh first: the distance, or infinity, and the number of the triangle.
-export function meet(origin, way, position, face) {
-  let nearest = Infinity;
-  let triangle = -1;
-  const [dx, dy, dz] = way;
-  for (let i = 0; i < face.length; i += 3) {
-    const a = 3 * face[i];
-    const b = 3 * face[i + 1];
-    const c = 3 * face[i + 2];
-    const ax = position[a];
-    const ay = position[a + 1];
-    const az = position[a + 2];
-    const ex = position[b] - ax;
-    const ey = position[b + 1] - ay;
-    const ez = position[b + 2] - az;
-    const fx = position[c] - ax;
-    const fy = position[c + 1] - ay;
-    const fz = position[c + 2] - az;
-    const px = dy * fz - dz * fy;
-    const py = dz * fx - dx * fz;
-    const pz = dx * fy - dy * fx;
-    const det = ex * px + ey * py + ez * pz;
-    if (det === 0) continue;
-    const sx = origin[0] - ax;
-    const sy = origin[1] - ay;
-    const sz = origin[2] - az;
-    const u = (sx * px + sy * py + sz * pz) / det;
-    if (u < 0 || u > 1) continue;
-    const qx = sy * ez - sz * ey;
-    const qy = sz * ex - sx * ez;
-    const qz = sx * ey - sy * ex;
-    const v = (dx * qx + dy * qy + dz * qz) / det;
-    const t = (fx * qx + fy * qy + fz * qz) / det;
-    if (v >= 0 && u + v <= 1 && t > 0 && t < nearest) [nearest, triangle] = [t, i / 3];
-  }
-  return { distance: nearest, triangle };
 }

@@ -78,6 +78,10 @@ export function unpack(data) {
   return { content: head.content, buffers };
 }
 
+// The numbers of a buffer that has come, of a kind such as Float32Array.
+export const numbers = (kind, { buffer, byteOffset, byteLength }) =>
+  new kind(buffer, byteOffset, byteLength / kind.BYTES_PER_ELEMENT);
+
 export function half(bits) {
   const exponent = (bits >> 10) & 31;
   const fraction = bits & 1023;

@@ -32,8 +32,9 @@ export function fillPage(page) {
   styled(page, "body { margin: 0; height: 100vh; background: #1a1a1a; } #viewer { height: 100%; }");
 }
 
-// The elements of a viewer in `shadow`. `on` has what its buttons do: `reset`, `undo`, `frame`, and `save` with what is chosen.
-export function frameOf(shadow, on) {
+// The elements of a viewer in `shadow`.
+/** @param {import("./viewer.js").Viewer} viewer */
+export function frameOf(shadow, viewer) {
   styled(shadow, STYLE);
   const frame = element("div", shadow, { className: "frame" });
   const stage = element("div", frame, { className: "stage" });
@@ -56,7 +57,7 @@ export function frameOf(shadow, on) {
   panel.setAttribute("role", "region");
   panel.setAttribute("aria-label", "controls");
   const help = helpOf(stage);
-  const dialog = dialogOf(frame, canvas, on.save);
+  const dialog = dialogOf(frame, canvas, viewer);
   const tool = (name, label, act) => {
     const node = element("button", tools, { type: "button", title: label, onclick: act });
     node.innerHTML = `<svg viewBox="0 0 16 16" aria-hidden="true"><path d="${ICONS[name]}"/></svg>`;
@@ -74,9 +75,10 @@ export function frameOf(shadow, on) {
   };
   help.querySelector("button").onclick = toggleHelp;
   tool("picture", "save a picture, a video or the state", () => dialog.open());
-  const [undo, redo] = [tool("undo", "undo (Z)", () => on.undo(-1)), tool("redo", "redo (Y)", () => on.undo(1))];
-  tool("frame", "show all of the part that was picked last, or of the scene (F)", on.frame);
-  tool("reset", "reset the view, the light, the materials and the display (R)", on.reset);
+  const undo = tool("undo", "undo (Z)", () => viewer.undo(-1));
+  const redo = tool("redo", "redo (Y)", () => viewer.undo(1));
+  tool("frame", "show all of the part that was picked last, or of the scene (F)", () => viewer.picking.frame());
+  tool("reset", "reset the view, the light, the materials and the display (R)", () => viewer.reset());
   tool("theme", "dark or light", () => theme(!frame.classList.contains("light")));
   tool("help", "help (H)", toggleHelp);
   const unfold = tool("panel", "controls", () => fold(!frame.classList.contains("folded")));

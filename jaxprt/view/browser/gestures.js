@@ -2,6 +2,7 @@
 
 import { clamp } from "./common.js";
 import { BACKGROUNDS } from "./drawing.js";
+import { droppedFiles, openFiles } from "./files.js";
 
 const GLIDE = 130; // milliseconds in which a turn that was let go falls to a third of its speed
 const STOPPED = 60; // milliseconds without a move after which the hand had stopped
@@ -39,13 +40,15 @@ export const HELP = [
   [keys("H"), "this help"],
 ];
 
-export function gestures(canvas, frame, on) {
+/** @param {import("./viewer.js").Viewer} viewer */
+export function gestures(canvas, frame, viewer) {
   const points = new Map();
   let pinch = null;
   const place = (event) => {
     const box = canvas.getBoundingClientRect();
     return [(2 * (event.clientX - box.left)) / box.width - 1, 1 - (2 * (event.clientY - box.top)) / box.height];
   };
+  /** @returns {[number, number]} */
   const aside = (event) => {
     const box = canvas.getBoundingClientRect();
     return [
@@ -63,12 +66,12 @@ export function gestures(canvas, frame, on) {
   const glide = (now) => {
     const passed = now - swing.at;
     const slower = Math.exp(-passed / GLIDE);
-    on.camera.orbit(swing.dx * passed, swing.dy * passed);
+    viewer.camera.orbit(swing.dx * passed, swing.dy * passed);
     swing =
       Math.hypot(swing.dx, swing.dy) * slower > SLOWEST
         ? { dx: swing.dx * slower, dy: swing.dy * slower, at: now, frame: requestAnimationFrame(glide) }
         : null;
-    on.moved();
+    viewer.moved();
   };
   const release = (event) => {
     points.delete(event.pointerId);
@@ -85,18 +88,18 @@ export function gestures(canvas, frame, on) {
   const listen = {
     contextmenu: (event) => event.preventDefault(),
     pointerdown(event) {
-      if (!on.camera) return;
+      if (!viewer.camera) return;
       canvas.focus({ preventScroll: true });
       hold();
       speed = null;
-      if (event.altKey) return on.pick(...place(event));
+      if (event.altKey) return viewer.picking.pick(...place(event));
       canvas.setPointerCapture(event.pointerId);
       points.set(event.pointerId, spot(event));
       pinch = points.size === 2 ? middle() : null;
     },
     pointermove(event) {
       const from = points.get(event.pointerId);
-      if (!from || !on.camera) return;
+      if (!from || !viewer.camera) return;
       const to = spot(event);
       const [dx, dy] = [to[0] - from[0], to[1] - from[1]];
       const height = canvas.clientHeight || 1;
@@ -105,30 +108,30 @@ export function gestures(canvas, frame, on) {
       speed = null;
       if (points.size === 2 && pinch) {
         const now = middle();
-        on.camera.zoom(pinch.apart / now.apart, aside({ clientX: now.at[0], clientY: now.at[1] }));
-        on.camera.pan((now.at[0] - pinch.at[0]) / height, (now.at[1] - pinch.at[1]) / height);
+        viewer.camera.zoom(pinch.apart / now.apart, aside({ clientX: now.at[0], clientY: now.at[1] }));
+        viewer.camera.pan((now.at[0] - pinch.at[0]) / height, (now.at[1] - pinch.at[1]) / height);
         pinch = now;
-      } else if (event.shiftKey) return on.set({ turn: on.state.turn + 0.01 * dx });
-      else if (event.ctrlKey || event.buttons & 2) on.camera.pan(dx / height, dy / height);
+      } else if (event.shiftKey) return viewer.set({ turn: viewer.state.turn + 0.01 * dx });
+      else if (event.ctrlKey || event.buttons & 2) viewer.camera.pan(dx / height, dy / height);
       else {
-        on.camera.orbit(0.01 * dx, 0.01 * dy);
+        viewer.camera.orbit(0.01 * dx, 0.01 * dy);
         const passed = Math.max(1, event.timeStamp - (before?.at ?? event.timeStamp - 16));
         speed = { dx: (0.01 * dx) / passed, dy: (0.01 * dy) / passed, at: event.timeStamp };
       }
-      on.moved();
+      viewer.moved();
     },
     pointerup: release,
     pointercancel: release,
     dblclick(event) {
-      if (!on.camera) return;
-      on.lookAt(...place(event));
+      if (!viewer.camera) return;
+      viewer.picking.lookAt(...place(event));
     },
     wheel(event) {
-      if (!on.camera) return;
+      if (!viewer.camera) return;
       event.preventDefault();
       hold();
-      on.camera.zoom(Math.exp(0.001 * clamp(event.deltaY, -300, 300)), aside(event));
-      on.moved();
+      viewer.camera.zoom(Math.exp(0.001 * clamp(event.deltaY, -300, 300)), aside(event));
+      viewer.moved();
     },
   };
   // Letters act wherever nothing is typed; arrows, + and - on the picture alone.
@@ -137,7 +140,7 @@ export function gestures(canvas, frame, on) {
     const elsewhere = from !== canvas;
     const taken = event.key.toLowerCase() === "z" || event.key.toLowerCase() === "y"; // keys of undo, which other programs have with Ctrl
     if (
-      !on.camera ||
+      !viewer.camera ||
       event.altKey ||
       ((event.metaKey || event.ctrlKey) && !taken) ||
       from.closest("dialog, input:not([type=range]), select")
@@ -146,11 +149,11 @@ export function gestures(canvas, frame, on) {
     if (
       elsewhere &&
       (event.key.length > 1 || "+-= ".includes(event.key)) &&
-      !(event.key === "Escape" && !on.help.hidden)
+      !(event.key === "Escape" && !viewer.view.help.hidden)
     )
       return;
     hold();
-    if (!key(event, on)) return;
+    if (!key(event, viewer)) return;
     event.preventDefault();
     event.stopPropagation();
   };
@@ -159,7 +162,7 @@ export function gestures(canvas, frame, on) {
   frame.addEventListener("dragover", (event) => event.preventDefault());
   frame.addEventListener("drop", (event) => {
     event.preventDefault();
-    dropped(event.dataTransfer).then((files) => files.length && on.drop(files));
+    droppedFiles(event.dataTransfer).then((files) => files.length && openFiles(viewer, files));
   });
   return {
     get held() {
@@ -173,78 +176,47 @@ export function gestures(canvas, frame, on) {
   };
 }
 
-// The files that were dropped, with those in folders, each with its place.
-async function dropped(data) {
-  const entries = [...data.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
-  const files = [...data.files].map((file) => ({ place: file.name, file }));
-  if (!entries.some((entry) => entry.isDirectory)) return files;
-  const found = [];
-  const walk = async (entry) => {
-    if (entry.isFile)
-      return found.push({
-        place: entry.fullPath.slice(1),
-        file: await new Promise((resolve, reject) => entry.file(resolve, reject)),
-      });
-    const reader = entry.createReader();
-    for (;;) {
-      // browsers tell some at a time
-      const some = await new Promise((resolve, reject) => reader.readEntries(resolve, reject));
-      if (!some.length) return;
-      for (const each of some) await walk(each);
-    }
-  };
-  for (const entry of entries) await walk(entry);
-  return found;
-}
-
-function key(event, on) {
-  const { state } = on;
-  const scene = on.scene();
+/** @param {import("./viewer.js").Viewer} viewer */
+function key(event, viewer) {
+  const { state, scene, camera, view } = viewer;
   const names = Object.keys(scene.systems);
   const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
   const next = names[(names.indexOf(state.system) + 1) % names.length];
-  if (arrow && event.shiftKey) {
-    on.camera.pan(0.05 * arrow[0], 0.05 * arrow[1]);
-    on.moved();
-  } else if (arrow) {
-    on.camera.orbit(0.1 * arrow[0], 0.1 * arrow[1]);
-    on.moved();
-  } else {
-    const act = {
-      "+": () => {
-        on.camera.zoom(0.9);
-        on.moved();
-      },
-      "=": () => {
-        on.camera.zoom(0.9);
-        on.moved();
-      },
-      "-": () => {
-        on.camera.zoom(1 / 0.9);
-        on.moved();
-      },
-      "[": () => on.set({ turn: state.turn - 0.1 }),
-      "]": () => on.set({ turn: state.turn + 0.1 }),
-      ",": () => on.expose(state.stops - 0.5),
-      ".": () => on.expose(state.stops + 0.5),
-      // What changes nothing leaves the picture at rest.
-      l: () => scene.lights.length > 1 && on.set({ light: (state.light + 1) % scene.lights.length }),
-      s: () => names.length > 1 && on.set({ system: next, bounces: state.bounces && scene.systems[next].bounces }),
-      b: () => scene.systems[state.system].bounces && on.set({ bounces: !state.bounces }),
-      g: () => on.set({ background: BACKGROUNDS[(BACKGROUNDS.indexOf(state.background) + 1) % BACKGROUNDS.length] }),
-      p: () => on.set({ still: !state.still }),
-      e: () => on.set({ exact: !state.exact }),
-      z: () => on.undo(event.shiftKey ? 1 : -1),
-      y: () => on.undo(1),
-      f: () => on.frame(),
-      c: () => state.lamps.length && on.set({ lamps: [] }),
-      r: () => on.reset(),
-      a: () => on.automatic(true),
-      h: () => on.toggleHelp(),
-      escape: () => on.help.hidden || on.toggleHelp(),
-    }[event.key.toLowerCase()];
-    if (!act) return false;
-    act();
+  const expose = (stops) => viewer.set({ auto: false, stops: clamp(stops, -20, 20) });
+  const zoom = (factor) => {
+    camera.zoom(factor);
+    viewer.moved();
+  };
+  if (arrow) {
+    if (event.shiftKey) camera.pan(0.05 * arrow[0], 0.05 * arrow[1]);
+    else camera.orbit(0.1 * arrow[0], 0.1 * arrow[1]);
+    viewer.moved();
+    return true;
   }
-  return true;
+  const act = {
+    "+": () => zoom(0.9),
+    "=": () => zoom(0.9),
+    "-": () => zoom(1 / 0.9),
+    "[": () => viewer.set({ turn: state.turn - 0.1 }),
+    "]": () => viewer.set({ turn: state.turn + 0.1 }),
+    ",": () => expose(state.stops - 0.5),
+    ".": () => expose(state.stops + 0.5),
+    // What changes nothing leaves the picture at rest.
+    l: () => scene.lights.length > 1 && viewer.set({ light: (state.light + 1) % scene.lights.length }),
+    s: () => names.length > 1 && viewer.set({ system: next, bounces: state.bounces && scene.systems[next].bounces }),
+    b: () => scene.systems[state.system].bounces && viewer.set({ bounces: !state.bounces }),
+    g: () => viewer.set({ background: BACKGROUNDS[(BACKGROUNDS.indexOf(state.background) + 1) % BACKGROUNDS.length] }),
+    p: () => viewer.set({ still: !state.still }),
+    e: () => viewer.set({ exact: !state.exact }),
+    z: () => viewer.undo(event.shiftKey ? 1 : -1),
+    y: () => viewer.undo(1),
+    f: () => viewer.picking.frame(),
+    c: () => state.lamps.length && viewer.set({ lamps: [] }),
+    r: () => viewer.reset(),
+    a: () => viewer.set({ auto: true }),
+    h: () => view.toggleHelp(),
+    escape: () => view.help.hidden || view.toggleHelp(),
+  }[event.key.toLowerCase()];
+  act?.();
+  return Boolean(act);
 }

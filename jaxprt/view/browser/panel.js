@@ -2,6 +2,7 @@
 
 import { clamp, dot, element, half, hex, toDisplay, unhex } from "./common.js";
 import { BACKGROUNDS, TONES } from "./drawing.js";
+import { openFiles } from "./files.js";
 
 const MANY = 3; // parts up to which all of their controls are open at first; of more, the first
 const FILTER = 10; // parts up to which one is open at first; of more, names can be searched
@@ -51,7 +52,11 @@ function slider(
   return node;
 }
 
-export function panelOf(panel, scene, state, { set, expose, automatic, map, moved, widen, camera, open }) {
+/** @param {import("./viewer.js").Viewer} viewer */
+export function panelOf(viewer) {
+  const { scene, state } = viewer;
+  const { panel } = viewer.view;
+  const set = (fields) => viewer.set(fields);
   panel.textContent = "";
   const choice = (parent, text, names, pick) => {
     const node = element("select", row(parent, text));
@@ -108,7 +113,10 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
     hidden: true,
   });
   file.onchange = () => {
-    if (file.files.length) open([...file.files]);
+    openFiles(
+      viewer,
+      [...file.files].map((light) => ({ place: light.name, file: light })),
+    );
     file.value = "";
   };
   element("button", buttons, {
@@ -131,22 +139,22 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
     viewPart,
     "exposure",
     { low: -12, high: 12, step: 0.1, digits: 2, wrap: (x) => clamp(x, -20, 20) },
-    expose,
+    (stops) => set({ auto: false, stops }),
   );
-  const auto = box(viewPart, "automatic exposure", "auto");
-  auto[1].onchange = () => automatic(auto[1].checked);
-  const tone = choice(viewPart, "tone curve", TONES, (i) => map(TONES[i]));
-  const wide = slider(viewPart, "view angle °", { low: 5, high: 120, step: 1, digits: 1 }, (degrees) =>
-    widen(degrees * DEGREE),
-  );
+  const boxes = [box(viewPart, "automatic exposure", "auto")];
+  const tone = choice(viewPart, "tone curve", TONES, (i) => set({ tone: TONES[i] }));
+  const wide = slider(viewPart, "view angle °", { low: 5, high: 120, step: 1, digits: 1 }, (degrees) => {
+    viewer.camera.widen(degrees * DEGREE);
+    viewer.moved();
+  });
   const behind = choice(viewPart, "background", BACKGROUNDS, (i) => set({ background: BACKGROUNDS[i] }));
   const ground = element("input", row(viewPart, "its color"), { type: "color" });
   ground.oninput = () => set({ ground: [1, 3, 5].map((i) => parseInt(ground.value.slice(i, i + 2), 16) / 255) });
-  const boxes = [auto];
   if (scene.rests.includes("still")) boxes.push(box(viewPart, "fine picture at rest", "still"));
   if (scene.rests.includes("exact")) boxes.push(box(viewPart, "exact picture at rest", "exact"));
   if (Object.values(scene.systems).some((each) => each.bounces)) boxes.push(box(viewPart, "bounces", "bounces"));
 
+  let seen = 0; // the angle of view that is told
   const free = scene.parts.filter((part) => part.free);
   const parts = new Map();
   const materialPart = free.length
@@ -160,7 +168,7 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
   }
   for (const part of free) {
     const opened = free.length <= MANY || (!parts.size && free.length <= FILTER);
-    parts.set(part.name, materialOf(materialPart, part, state, opened, moved));
+    parts.set(part.name, materialOf(materialPart, part, state, opened, set));
   }
   return {
     show() {
@@ -170,7 +178,6 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
       turn.show(sides.wrap(state.turn / DEGREE));
       if (system) system.value = names.indexOf(state.system);
       exposure.show(state.stops);
-      wide.show(camera().angle / DEGREE);
       tone.value = TONES.indexOf(state.tone);
       behind.value = BACKGROUNDS.indexOf(state.background);
       ground.value = `#${state.ground
@@ -204,7 +211,12 @@ export function panelOf(panel, scene, state, { set, expose, automatic, map, move
       this.show();
     },
     paint: strip.paint,
-    look: strip.look,
+    // Where the camera stands, and how wide it sees.
+    look({ azimuth, angle }) {
+      strip.look(azimuth);
+      if (angle !== seen) wide.show(angle / DEGREE);
+      seen = angle;
+    },
     // Opens the controls of a part, by its name, and marks it.
     pick(name) {
       for (const [each, part] of parts) part.box.classList.toggle("picked", each === name);
@@ -302,9 +314,9 @@ function stripOf(canvas, tint, state, set) {
   };
   canvas.onpointermove = (event) => {
     if (!last || dot(last, at(event)) > Math.cos(0.12) || state.lamps.length >= 200) return;
-    if (!painted) state.lamps = [...state.lamps, lamp(last, 0.15, 2)];
+    const ways = painted ? [at(event)] : [last, at(event)];
     [last, painted] = [at(event), true];
-    set({ lamps: [...state.lamps, lamp(last, 0.15, 2)] });
+    set({ lamps: [...state.lamps, ...ways.map((way) => lamp(way, 0.15, 2))] });
   };
   canvas.onpointerup = (event) => {
     if (last && !painted) set({ lamps: [...state.lamps, lamp(at(event), 0.05, 300)] });
@@ -339,24 +351,20 @@ function stripOf(canvas, tint, state, set) {
       draw();
     },
     look(angle) {
-      if (angle !== azimuth) {
-        azimuth = angle;
-        draw();
-      }
-    }, // where the camera stands
+      if (angle === azimuth) return;
+      azimuth = angle;
+      draw();
+    },
   };
 }
 
 // The controls of one part: by their names in its model, and a plane where roughness and reflectance both act.
-function materialOf(parent, part, state, opened, moved) {
+function materialOf(parent, part, state, opened, set) {
   const { free } = part;
   const value = (name) => state.materials[part.name]?.[name] ?? free[name];
   const node = section(parent, part.name, opened, "part");
-  const change = (fields) => {
-    state.materials = { ...state.materials, [part.name]: { ...state.materials[part.name], ...fields } };
-    show();
-    moved();
-  };
+  const change = (fields) =>
+    set({ materials: { ...state.materials, [part.name]: { ...state.materials[part.name], ...fields } } });
   const blinn = free.exponent !== undefined;
   const metallic = free.metallic !== undefined;
   const shows = [];
@@ -400,10 +408,8 @@ function materialOf(parent, part, state, opened, moved) {
     textContent: "as it was",
   });
   reset.onclick = () => {
-    const { [part.name]: _, ...others } = state.materials;
-    state.materials = others;
-    show();
-    moved();
+    const { [part.name]: _, ...materials } = state.materials;
+    set({ materials });
   };
   shows.push(() => {
     reset.disabled = !state.materials[part.name];

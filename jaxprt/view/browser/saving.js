@@ -18,9 +18,9 @@ const KINDS = {
   glb: ["scene with its materials, GLB", { python: true }],
 };
 
-// Asks what is to be saved, and how. `make` returns a file for a choice and says meanwhile how far it is; `python` says
-// whether there is one.
-export function dialogOf(parent, canvas, { make, python }) {
+// Asks what is to be saved, and how.
+/** @param {import("./viewer.js").Viewer} viewer */
+export function dialogOf(parent, canvas, viewer) {
   const dialog = element("dialog", parent);
   const form = element("form", dialog, { method: "dialog" });
   dialog.setAttribute("aria-label", "save");
@@ -72,13 +72,10 @@ export function dialogOf(parent, canvas, { make, python }) {
     lock(true);
     note.textContent = "it is being made";
     try {
-      const { blob, name } = await make(
-        choice,
-        (text) => {
-          if (!own.aborted) note.textContent = text;
-        },
-        own,
-      );
+      const say = (text) => {
+        if (!own.aborted) note.textContent = text;
+      };
+      const { blob, name } = await made(viewer, choice, say, own);
       if (own.aborted) return;
       const link = element("a", form, { href: URL.createObjectURL(blob), download: name });
       link.click();
@@ -100,7 +97,8 @@ export function dialogOf(parent, canvas, { make, python }) {
         // else the dialog was left while its picture is being made
         note.textContent = kind.textContent = "";
         for (const [name, [text, { python: needs }]] of Object.entries(KINDS))
-          if (!needs || python()) element("option", kind, { value: name, textContent: text });
+          if (!needs || viewer.scene?.rests.includes("picture"))
+            element("option", kind, { value: name, textContent: text });
         const {
           transparent,
           kind: last,
@@ -122,8 +120,60 @@ export function dialogOf(parent, canvas, { make, python }) {
   };
 }
 
+// What is chosen as a file with its name; `told` says meanwhile how far it is.
+/** @param {import("./viewer.js").Viewer} viewer */
+async function made(viewer, choice, told, signal) {
+  const { scene, camera, state } = viewer;
+  const { kind } = choice;
+  const json = (text) => new Blob([text], { type: "application/json" });
+  if (!scene) throw new Error("there is no scene yet");
+  if (kind === "state") return { blob: json(viewer.text()), name: "jaxprt.json" };
+  if (kind === "materials") return { blob: json(materials(scene, state.materials)), name: "materials.json" };
+  if (kind === "glb") {
+    const { buffers } = await viewer.demand(viewer.message("glb"));
+    return { blob: new Blob([buffers[0]], { type: "model/gltf-binary" }), name: "jaxprt.glb" };
+  }
+  const quick = { ...choice, samples: 4, transparent: false };
+  const frames = {
+    orbit: (share) => picture(viewer, quick, camera.around(2 * Math.PI * share)),
+    turn: (share) => picture(viewer, quick, camera, { turn: state.turn + 2 * Math.PI * share }),
+  };
+  try {
+    if (!frames[kind]) return { blob: await picture(viewer, { ...choice, format: kind }), name: `jaxprt.${kind}` };
+    const blob = await video(frames[kind], choice, told, signal);
+    return { blob, name: `jaxprt.${blob.type.split("/")[1]}` };
+  } finally {
+    viewer.drawing.gpu?.change(viewer.message("look"));
+    viewer.redraw();
+  }
+}
+
+// A picture of any size as a file: by Python where there is one, else by the graphics card. `fields` are those of the
+// state that are others for it.
+/** @param {import("./viewer.js").Viewer} viewer */
+async function picture(viewer, choice, camera = viewer.camera, fields = {}) {
+  const { scene, drawing, state } = viewer;
+  const { width, height, transparent, format = "png", samples } = choice;
+  const shows = { ...state, ...fields, background: transparent ? "none" : state.background };
+  const look = { ...fields, eye: camera.eye };
+  if (!scene.rests.includes("picture")) {
+    drawing.gpu?.change({ ...viewer.message("look"), ...look });
+    return drawn(await drawing.picture(camera, shows, scene.center, width, height), width, height);
+  }
+  const over = !transparent && format === "png" && state.background !== "light";
+  const size = { width, height, transparent: transparent || over, format, samples };
+  const asked = { ...viewer.message("picture"), ...look, stops: state.stops, ...size };
+  const text = `a picture of ${width} x ${height} pixels`;
+  const { content, buffers } = await viewer.waiting.during("picture", text, viewer.demand(asked), 0);
+  if (content.kind === "late") throw new Error("a better scene has come meanwhile: ask again");
+  const blob = new Blob([buffers[0]], { type: `image/${format}` });
+  if (!over) return blob;
+  const behind = drawing.backdrop(camera, shows, scene.center, width, height);
+  return drawn(behind, width, height, await createImageBitmap(blob));
+}
+
 // Pixels that the graphics card has drawn as a PNG file, with an image over them.
-export async function drawn({ pixel, parts }, width, height, over = null) {
+async function drawn({ pixel, parts }, width, height, over = null) {
   const row = 4 * parts * width;
   const canvas = Object.assign(document.createElement("canvas"), { width, height });
   const context = canvas.getContext("2d");
@@ -146,7 +196,7 @@ export async function drawn({ pixel, parts }, width, height, over = null) {
 
 // A video of pictures. `picture` makes the one of a share of the whole, from 0 on. Browsers record what a canvas shows,
 // so that all pictures are made first and then shown at their times.
-export async function video(picture, { width, height, seconds }, told, signal) {
+async function video(picture, { width, height, seconds }, told, signal) {
   const type = VIDEOS.find((each) => window.MediaRecorder?.isTypeSupported(each));
   const frames = Math.round(seconds * RATE);
   const pictures = [];
@@ -183,7 +233,7 @@ export async function video(picture, { width, height, seconds }, told, signal) {
 }
 
 // The materials of all parts that can change, as they are now.
-export function materials(scene, changed) {
+function materials(scene, changed) {
   const free = scene.parts
     .filter((part) => part.free)
     .map(({ name, free }) => [

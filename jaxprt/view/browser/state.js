@@ -1,21 +1,30 @@
-// The state of a viewer: what undo takes back, and what addresses and files hold.
+// The state of a viewer: what the user has chosen, what undo takes back, and what addresses and files hold.
 
 const KEPT = 200; // states that can be taken back
 const SETTLED = 300; // milliseconds without a change after which a state is one of them
-const FIELDS = [
-  "system",
-  "turn",
-  "lamps",
-  "auto",
-  "tone",
-  "background",
-  "ground",
-  "bounces",
-  "still",
-  "exact",
-  "materials",
-];
 const DIGITS = 10;
+
+/** @typedef {{ direction: number[], angle: number, radiance: number[] }} Lamp */
+/** @typedef {ReturnType<typeof initial>} State */
+
+// What is chosen at the start.
+export const initial = () => ({
+  system: "",
+  light: 0,
+  turn: 0,
+  lamps: /** @type {Lamp[]} */ ([]),
+  stops: 0,
+  auto: true,
+  tone: "srgb",
+  background: "light",
+  ground: [0.8, 0.8, 0.8],
+  bounces: false,
+  still: true,
+  exact: false,
+  materials: /** @type {Record<string, Record<string, number | number[]>>} */ ({}),
+});
+// Lights have names in texts, and stops are found where they are automatic.
+const FIELDS = Object.keys(initial()).filter((name) => name !== "light" && name !== "stops");
 
 // A state as text: JSON. Places are those of the file, whose origin the scene has, and the light has its name.
 export function written(state, camera, scene, aspect) {
