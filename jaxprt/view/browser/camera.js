@@ -60,11 +60,8 @@ export class Camera {
   frame(low, high, aspect) {
     this.target = add(low, high).map((x) => x / 2);
     const half = Math.min(this.angle / 2, Math.atan(aspect * Math.tan(this.angle / 2)));
-    this.distance = clamp(
-      Math.hypot(...add(high, low, -1)) / 2 / Math.sin(half),
-      1e-3 * this.radius,
-      1e3 * this.radius,
-    );
+    const distance = Math.hypot(...add(high, low, -1)) / 2 / Math.sin(half);
+    this.distance = clamp(distance, 1e-3 * this.radius, 1e3 * this.radius);
   }
   ray(aspect) {
     // columns: to the right, up and forward, for coordinates from -1 to 1

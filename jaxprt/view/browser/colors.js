@@ -43,7 +43,7 @@ export class Colors {
         this.partial = asked.vertices === "seen";
         viewer.drawing.setColor(encoded ? this.bytes : numbers(Uint16Array, buffers[0]), encoded, content.scale);
         if (unexposed) viewer.measure(asked.light);
-        this.count(content, performance.now() - began, buffers);
+        this.learn(content, performance.now() - began, buffers);
         viewer.redraw();
       }
     } catch (error) {
@@ -62,7 +62,7 @@ export class Colors {
     else if (stats.shown === stats.seq) viewer.rests.begin();
   }
   // Learns from an answer how long the way is, and says how long its parts took.
-  count({ ms, seq }, trip, buffers) {
+  learn({ ms, seq }, trip, buffers) {
     const { viewer } = this;
     const { stats } = viewer;
     const spent = ms.light + ms.view + ms.combine;
@@ -76,12 +76,9 @@ export class Colors {
     this.framed = performance.now();
     if (viewer.drawing.gpu) return;
     const digits = (x) => x.toFixed(x < 10 ? 1 : 0);
-    const parts = ["light", "view", "combine"].map((name) => `${name} ${digits(ms[name])} ms`);
-    parts.push(
-      `there and back ${digits(trip)} ms`,
-      ...(rate ? [`${digits(rate)}/s`] : []),
-      `${(size / 1024).toFixed(0)} kB`,
-    );
+    const times = { light: ms.light, view: ms.view, combine: ms.combine, "there and back": trip };
+    const parts = Object.entries(times).map(([name, time]) => `${name} ${digits(time)} ms`);
+    parts.push(...(rate ? [`${digits(rate)}/s`] : []), `${(size / 1024).toFixed(0)} kB`);
     const { reason } = viewer.gpu;
     viewer.describe(parts.join(" · "), reason && ` · colors from Python: ${reason}`);
   }

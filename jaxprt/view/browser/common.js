@@ -10,15 +10,10 @@ export const unit = (v) => {
 export const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
 export const toLinear = (x) => (x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4);
 export const toDisplay = (x) => (x <= 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 2.4) - 0.055);
-export const hex = (color) =>
-  `#${color
-    .map((x) =>
-      Math.round(255 * toDisplay(clamp(x, 0, 1)))
-        .toString(16)
-        .padStart(2, "0"),
-    )
-    .join("")}`;
-export const unhex = (text) => [1, 3, 5].map((i) => toLinear(parseInt(text.slice(i, i + 2), 16) / 255));
+// Colors of the display as text, and back.
+const byte = (x) => Math.round(255 * clamp(x, 0, 1));
+export const hex = (color) => `#${color.map((x) => byte(x).toString(16).padStart(2, "0")).join("")}`;
+export const unhex = (text) => [1, 3, 5].map((i) => parseInt(text.slice(i, i + 2), 16) / 255);
 
 const LONGEST = 2048; // pixels of the longer edge of what is drawn for the window
 

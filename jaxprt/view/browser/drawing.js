@@ -86,11 +86,8 @@ export class Drawing {
     gl.programs = new Map(); // those of a context that was lost are gone
     const program = (vertex, fragment) => {
       const handle = gl.createProgram();
-      for (const [kind, text] of [
-        [gl.VERTEX_SHADER, vertex],
-        [gl.FRAGMENT_SHADER, fragment],
-      ]) {
-        const shader = gl.createShader(kind);
+      for (const text of [vertex, fragment]) {
+        const shader = gl.createShader(text === vertex ? gl.VERTEX_SHADER : gl.FRAGMENT_SHADER);
         gl.shaderSource(shader, text);
         gl.compileShader(shader);
         if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost())
@@ -147,17 +144,8 @@ export class Drawing {
     gl.bindTexture(gl.TEXTURE_2D, handle);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     const [form, bytes, halves] = alpha ? [gl.RGBA, gl.RGBA8, gl.RGBA16F] : [gl.RGB, gl.RGB8, gl.RGB16F];
-    gl.texImage2D(
-      gl.TEXTURE_2D,
-      0,
-      encoded ? bytes : halves,
-      width,
-      height,
-      0,
-      form,
-      encoded ? gl.UNSIGNED_BYTE : gl.HALF_FLOAT,
-      data,
-    );
+    const [inside, type] = encoded ? [bytes, gl.UNSIGNED_BYTE] : [halves, gl.HALF_FLOAT];
+    gl.texImage2D(gl.TEXTURE_2D, 0, inside, width, height, 0, form, type, data);
     for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, side, gl.LINEAR);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, repeat ? gl.REPEAT : gl.CLAMP_TO_EDGE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
@@ -170,17 +158,8 @@ export class Drawing {
     this.skyImage = this.texture(data, width, height, false, true);
     for (let level = 1, first = 3 * width * height; level < levels; level++) {
       const [w, h] = [width >> level, height >> level];
-      gl.texImage2D(
-        gl.TEXTURE_2D,
-        level,
-        gl.RGB16F,
-        w,
-        h,
-        0,
-        gl.RGB,
-        gl.HALF_FLOAT,
-        data.subarray(first, (first += 3 * w * h)),
-      );
+      const pixel = data.subarray(first, (first += 3 * w * h));
+      gl.texImage2D(gl.TEXTURE_2D, level, gl.RGB16F, w, h, 0, gl.RGB, gl.HALF_FLOAT, pixel);
     }
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, levels - 1);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
@@ -193,11 +172,8 @@ export class Drawing {
   }
   // The light as it is seen, its brightness, and the level of detail of its image; null where it is not the background.
   behind(camera, state, height) {
-    if (state.background === "light" && this.skyImage)
-      return {
-        image: this.skyImage,
-        lod: Math.log2((2 * Math.tan(camera.angle / 2) * this.skyHeight) / (height * Math.PI)),
-      };
+    const lod = Math.log2((2 * Math.tan(camera.angle / 2) * this.skyHeight) / (height * Math.PI));
+    if (state.background === "light" && this.skyImage) return { image: this.skyImage, lod };
     if (state.background !== "blurred light" || !this.skyImage) return null;
     this.blurredImage ??= this.texture(blurred(this.coarseSky), 2 * BLURRED, BLURRED, false, true);
     return { image: this.blurredImage, lod: 0 };
@@ -217,13 +193,9 @@ export class Drawing {
         all[4 * i + 3] = encoded ? cover[i] : toHalf(cover[i] / 255);
       }
     }
-    this.stills.push({
-      image: this.texture(all, width, height, encoded, false, cover !== null),
-      encoded,
-      scale,
-      clear: cover !== null,
-      since: performance.now(),
-    });
+    const clear = cover !== null;
+    const image = this.texture(all, width, height, encoded, false, clear);
+    this.stills.push({ image, encoded, scale, clear, since: performance.now() });
   }
   dropStills(kept) {
     while (this.stills.length > kept) this.gl.deleteTexture(this.stills.shift().image);
@@ -362,19 +334,10 @@ export class Drawing {
     const result = new Uint8Array(4 * width * height);
     if (this.gpu && !image) this.gpu.piece.vertices(this.gpu.message);
     gl.bindFramebuffer(gl.FRAMEBUFFER, many);
-    const buffers = [
-      buffer(samples, gl.RGBA8, gl.COLOR_ATTACHMENT0),
-      buffer(samples, gl.DEPTH_COMPONENT24, gl.DEPTH_ATTACHMENT),
-    ];
-    this.paint(
-      camera,
-      state,
-      center,
-      { width, height },
-      state.background === "color" ? this.ground(state) : [0, 0, 0, 0],
-      image,
-      surfaces,
-    );
+    const buffers = [buffer(samples, gl.RGBA8, gl.COLOR_ATTACHMENT0)];
+    buffers.push(buffer(samples, gl.DEPTH_COMPONENT24, gl.DEPTH_ATTACHMENT));
+    const ground = state.background === "color" ? this.ground(state) : [0, 0, 0, 0];
+    this.paint(camera, state, center, { width, height }, ground, image, surfaces);
     gl.bindFramebuffer(gl.FRAMEBUFFER, one);
     buffers.push(buffer(0, gl.RGBA8, gl.COLOR_ATTACHMENT0));
     gl.bindFramebuffer(gl.READ_FRAMEBUFFER, many);
@@ -404,14 +367,8 @@ export class Drawing {
   exposure(camera, state, center) {
     const height = 96;
     const width = Math.max(1, Math.round((height * this.canvas.width) / this.canvas.height));
-    const pixel = this.pixels(
-      camera,
-      { ...state, stops: 0, tone: "", background: "none" },
-      center,
-      { width, height },
-      this.gpu?.shown,
-      0,
-    );
+    const measured = { ...state, stops: 0, tone: "", background: "none" };
+    const pixel = this.pixels(camera, measured, center, { width, height }, this.gpu?.shown, 0);
     const lit = [];
     for (let i = 0; i < pixel.length; i += 4)
       if (pixel[i + 3] === 255 && pixel[i] + pixel[i + 1]) lit.push(pixel[i] + pixel[i + 1] / 255);

@@ -32,11 +32,12 @@ export async function openFiles(viewer, files) {
   try {
     const opens = files.some(({ place }) => MESHES.test(place));
     const parts = files.filter(({ place }) => opens && !LIGHTS.test(place));
-    for (const { file } of files.filter((other) => !parts.includes(other))) await openLight(viewer, file);
+    for (const dropped of files) if (!parts.includes(dropped)) await openLight(viewer, dropped.file);
     if (!opens) return;
     viewer.fault = "";
-    const names = parts.map(({ place }) => place);
-    await send(viewer, { kind: "open", names }, parts.map(({ file }) => file)); // biome-ignore format: one call
+    const message = { kind: "open", names: parts.map(({ place }) => place) };
+    const scene = parts.map(({ file }) => file);
+    await send(viewer, message, scene);
     viewer.scenes.follow();
   } catch (error) {
     viewer.stats.errors++;

@@ -38,35 +38,26 @@ export function frameOf(shadow, viewer) {
   styled(shadow, STYLE);
   const frame = element("div", shadow, { className: "frame" });
   const stage = element("div", frame, { className: "stage" });
-  const canvas = element("canvas", stage, { className: "canvas", tabIndex: 0 });
-  canvas.setAttribute("role", "application");
-  canvas.setAttribute("aria-label", "the scene; press H for the keys");
-  const bar = element("div", stage, { className: "busy", hidden: true });
-  bar.setAttribute("role", "progressbar");
+  const canvas = element("canvas", stage, { className: "canvas", tabIndex: 0, role: "application" });
+  canvas.ariaLabel = "the scene; press H for the keys";
+  const bar = element("div", stage, { className: "busy", hidden: true, role: "progressbar" });
   const words = element("div", stage, { className: "words" });
-  const waiting = element("div", words, { className: "stagetext", hidden: true });
-  const told = element("div", words, { className: "told", hidden: true });
+  const waiting = element("div", words, { className: "stagetext", hidden: true, role: "status" });
+  const told = element("div", words, { className: "told", hidden: true, role: "status" });
   const line = element("div", stage, { className: "line" });
-  for (const each of [waiting, told]) each.setAttribute("role", "status");
   const hint = element("div", stage, {
     className: "hint",
     innerHTML: matchMedia("(pointer: coarse)").matches ? HINT.touch : HINT.mouse,
   });
   const tools = element("div", stage, { className: "tools" });
-  const panel = element("div", frame, { className: "panel" });
-  panel.setAttribute("role", "region");
-  panel.setAttribute("aria-label", "controls");
+  const panel = element("div", frame, { className: "panel", role: "region", ariaLabel: "controls" });
   const help = helpOf(stage);
   const dialog = dialogOf(frame, canvas, viewer);
   const tool = (name, label, act) => {
-    const node = element("button", tools, { type: "button", title: label, onclick: act });
-    node.innerHTML = `<svg viewBox="0 0 16 16" aria-hidden="true"><path d="${ICONS[name]}"/></svg>`;
-    node.setAttribute("aria-label", label);
-    return node;
+    const innerHTML = `<svg viewBox="0 0 16 16" aria-hidden="true"><path d="${ICONS[name]}"/></svg>`;
+    return element("button", tools, { type: "button", title: label, ariaLabel: label, onclick: act, innerHTML });
   };
-  const started = () => {
-    hint.hidden = true;
-  };
+  const started = () => (hint.hidden = true);
   const toggleHelp = () => {
     help.hidden = !help.hidden;
     started();
@@ -79,21 +70,24 @@ export function frameOf(shadow, viewer) {
   const redo = tool("redo", "redo (Y)", () => viewer.undo(1));
   tool("frame", "show all of the part that was picked last, or of the scene (F)", () => viewer.picking.frame());
   tool("reset", "reset the view, the light, the materials and the display (R)", () => viewer.reset());
-  tool("theme", "dark or light", () => theme(!frame.classList.contains("light")));
+  tool("theme", "dark or light", () => keep(!frame.classList.contains("light")));
   tool("help", "help (H)", toggleHelp);
   const unfold = tool("panel", "controls", () => fold(!frame.classList.contains("folded")));
   const fold = (folded) => {
     frame.classList.toggle("folded", folded);
-    unfold.setAttribute("aria-pressed", String(!folded));
+    unfold.ariaPressed = String(!folded);
   };
   const theme = (light) => {
     frame.classList.toggle("light", light);
+    frame.dispatchEvent(new Event("theme"));
+  };
+  const keep = (light) => {
+    theme(light);
     try {
       localStorage.setItem("jaxprt-theme", light ? "light" : "dark");
     } catch {
       /* pages without storage forget it */
     }
-    frame.dispatchEvent(new Event("theme"));
   };
   const preferred = matchMedia("(prefers-color-scheme: light)");
   let stored = null;
@@ -102,11 +96,8 @@ export function frameOf(shadow, viewer) {
   } catch {
     /* likewise */
   }
-  frame.classList.toggle("light", stored ? stored === "light" : preferred.matches);
-  preferred.addEventListener("change", (event) => {
-    frame.classList.toggle("light", event.matches);
-    frame.dispatchEvent(new Event("theme"));
-  });
+  theme(stored ? stored === "light" : preferred.matches);
+  preferred.addEventListener("change", (event) => theme(event.matches));
   fold(false);
   const watch = new ResizeObserver(() => {
     const narrow = frame.clientWidth <= NARROW;
@@ -123,10 +114,8 @@ export function frameOf(shadow, viewer) {
     line,
     help,
     toggleHelp,
-    dialog,
-    unfold() {
-      fold(false);
-    },
+    unfold: () => fold(false),
+    close: () => watch.disconnect(),
     // Whether there is something to undo, and to redo.
     steps(back, ahead) {
       [undo.disabled, redo.disabled] = [!back, !ahead];
@@ -139,27 +128,18 @@ export function frameOf(shadow, viewer) {
     busy(text, part = null) {
       bar.hidden = waiting.hidden = !text;
       bar.classList.toggle("open", part === null);
-      if (part === null) {
-        bar.style.removeProperty("--part");
-        bar.removeAttribute("aria-valuenow");
-      } else {
-        bar.style.setProperty("--part", clamp(part, 0, 1));
-        bar.setAttribute("aria-valuenow", Math.round(100 * clamp(part, 0, 1)));
-      }
-      bar.setAttribute("aria-label", text || "nothing is waited for");
-      const shown = text && part !== null ? `${text}: ${Math.round(100 * clamp(part, 0, 1))} %` : text || "";
+      const percent = part === null ? null : String(Math.round(100 * clamp(part, 0, 1)));
+      bar.style.setProperty("--part", part === null ? null : clamp(part, 0, 1));
+      bar.ariaValueNow = percent;
+      bar.ariaLabel = text || "nothing is waited for";
+      const shown = text && percent ? `${text}: ${percent} %` : text || "";
       if (waiting.textContent !== shown) waiting.textContent = shown;
-    },
-    close() {
-      watch.disconnect();
     },
   };
 }
 
 function helpOf(parent) {
-  const help = element("div", parent, { className: "help", hidden: true });
-  help.setAttribute("role", "dialog");
-  help.setAttribute("aria-label", "help");
+  const help = element("div", parent, { className: "help", hidden: true, role: "dialog", ariaLabel: "help" });
   const head = element("header", help);
   element("span", head, { textContent: "Mouse, fingers and keys" });
   element("button", head, { type: "button", textContent: "close" });

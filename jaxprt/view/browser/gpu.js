@@ -38,7 +38,7 @@ export class Gpu {
     }
     if (this.pixels && viewer.scene === scene) viewer.moved();
   }
-  // Why Python colors a state that has come to the GPU, which leaves it to Python where that is quicker.
+  // Why Python colors the present state; nothing where the GPU may. A slow one leaves it to Python if that is quicker.
   get reason() {
     const { state, scene, stats, colors } = this.viewer;
     if (this.lacking) return this.lacking;

@@ -1,6 +1,6 @@
 // The panel of controls: the light, the view, and the materials of the parts.
 
-import { clamp, dot, element, half, hex, toDisplay, unhex } from "./common.js";
+import { clamp, dot, element, half, hex, toDisplay, toLinear, unhex } from "./common.js";
 import { BACKGROUNDS, TONES } from "./drawing.js";
 import { openFiles } from "./files.js";
 
@@ -29,10 +29,9 @@ function slider(
   const node = element("div", parent, { className: "row", title });
   element("span", node, { textContent: text });
   const [from, to] = [of(low), of(high)].sort((a, b) => a - b);
-  const range = element("input", node, { type: "range", min: from, max: to, step: step ?? (to - from) / 200 });
-  const number = element("input", node, { type: "number", step: 10 ** -digits });
-  range.setAttribute("aria-label", text);
-  number.setAttribute("aria-label", `${text}, typed`);
+  const steps = { min: from, max: to, step: step ?? (to - from) / 200 };
+  const range = element("input", node, { type: "range", ariaLabel: text, ...steps });
+  const number = element("input", node, { type: "number", step: 10 ** -digits, ariaLabel: `${text}, typed` });
   range.oninput = () => pick(at(Number(range.value)));
   number.onchange = () => {
     if (number.value !== "" && Number.isFinite(Number(number.value))) pick(wrap(Number(number.value)));
@@ -47,7 +46,7 @@ function slider(
     const shown = String(Number(value.toFixed(digits)));
     if (range.value !== String(of(value))) range.value = of(value);
     if (number.value !== shown) number.value = shown;
-    range.setAttribute("aria-valuetext", shown);
+    range.ariaValueText = shown;
   };
   return node;
 }
@@ -59,8 +58,7 @@ export function panelOf(viewer) {
   const set = (fields) => viewer.set(fields);
   panel.textContent = "";
   const choice = (parent, text, names, pick) => {
-    const node = element("select", row(parent, text));
-    node.setAttribute("aria-label", text);
+    const node = element("select", row(parent, text), { ariaLabel: text });
     node.fill = (labels) => {
       node.textContent = "";
       labels.forEach((name, i) => element("option", node, { textContent: name, value: i }));
@@ -80,9 +78,8 @@ export function panelOf(viewer) {
 
   const lightPart = section(panel, "Light");
   const light = choice(lightPart, "light", scene.lights, (i) => set({ light: i }));
-  const gallery = element("div", lightPart, { className: "gallery", hidden: true });
-  gallery.setAttribute("role", "group");
-  gallery.setAttribute("aria-label", "the scene in each light");
+  const gallery = element("div", lightPart, { className: "gallery", hidden: true, role: "group" });
+  gallery.ariaLabel = "the scene in each light";
   const sides = { low: -180, high: 180, step: 1, digits: 1, wrap: (x) => ((((x + 180) % 360) + 360) % 360) - 180 };
   const turn = slider(lightPart, "rotation °", sides, (degrees) => set({ turn: degrees * DEGREE }));
   const sky = element("canvas", lightPart, {
@@ -91,12 +88,9 @@ export function panelOf(viewer) {
     height: 128,
     tabIndex: 0,
     title: "the light as it is turned; the mark at its lower edge is where the camera looks",
+    role: "application",
+    ariaLabel: "the light around the scene: a click or Enter puts a sun, a drag paints light, arrows move the place",
   });
-  sky.setAttribute("role", "application");
-  sky.setAttribute(
-    "aria-label",
-    "the light around the scene: a click or Enter puts a sun, a drag paints light, arrows move the place",
-  );
   element("div", lightPart, { className: "note", textContent: "Click to put a sun, drag to paint light." });
   const tint = element("input", row(lightPart, "sun color"), { type: "color", value: "#fff0d8" });
   const buttons = element("div", lightPart, { className: "row" });
@@ -113,10 +107,8 @@ export function panelOf(viewer) {
     hidden: true,
   });
   file.onchange = () => {
-    openFiles(
-      viewer,
-      [...file.files].map((light) => ({ place: light.name, file: light })),
-    );
+    const files = [...file.files].map((light) => ({ place: light.name, file: light }));
+    openFiles(viewer, files);
     file.value = "";
   };
   element("button", buttons, {
@@ -149,7 +141,7 @@ export function panelOf(viewer) {
   });
   const behind = choice(viewPart, "background", BACKGROUNDS, (i) => set({ background: BACKGROUNDS[i] }));
   const ground = element("input", row(viewPart, "its color"), { type: "color" });
-  ground.oninput = () => set({ ground: [1, 3, 5].map((i) => parseInt(ground.value.slice(i, i + 2), 16) / 255) });
+  ground.oninput = () => set({ ground: unhex(ground.value) });
   if (scene.rests.includes("still")) boxes.push(box(viewPart, "fine picture at rest", "still"));
   if (scene.rests.includes("exact")) boxes.push(box(viewPart, "exact picture at rest", "exact"));
   if (Object.values(scene.systems).some((each) => each.bounces)) boxes.push(box(viewPart, "bounces", "bounces"));
@@ -174,19 +166,13 @@ export function panelOf(viewer) {
     show() {
       if (light.length !== scene.lights.length) light.fill(scene.lights);
       light.value = state.light;
-      [...gallery.children].forEach((button, i) => button.setAttribute("aria-pressed", String(i === state.light)));
+      [...gallery.children].forEach((button, i) => (button.ariaPressed = String(i === state.light)));
       turn.show(sides.wrap(state.turn / DEGREE));
       if (system) system.value = names.indexOf(state.system);
       exposure.show(state.stops);
       tone.value = TONES.indexOf(state.tone);
       behind.value = BACKGROUNDS.indexOf(state.background);
-      ground.value = `#${state.ground
-        .map((x) =>
-          Math.round(255 * x)
-            .toString(16)
-            .padStart(2, "0"),
-        )
-        .join("")}`;
+      ground.value = hex(state.ground);
       ground.parentElement.hidden = state.background !== "color";
       clear.disabled = !state.lamps.length;
       for (const [key, each] of boxes) each.checked = state[key];
@@ -198,8 +184,8 @@ export function panelOf(viewer) {
       while (gallery.children.length <= number) {
         const at = gallery.children.length;
         const name = scene.lights[at];
-        const button = element("button", gallery, { type: "button", title: name, onclick: () => set({ light: at }) });
-        button.setAttribute("aria-label", `light: ${name}`);
+        const act = { onclick: () => set({ light: at }), ariaLabel: `light: ${name}` };
+        const button = element("button", gallery, { type: "button", title: name, ...act });
         element("canvas", button, { width, height });
       }
       const context = gallery.children[number].firstChild.getContext("2d");
@@ -235,7 +221,6 @@ export function panelOf(viewer) {
 // along its way.
 function stripOf(canvas, tint, state, set) {
   const image = document.createElement("canvas");
-  const width = () => canvas.width;
   const place = { x: 0.5, y: 0.25 };
   let source = null;
   let drawn = "";
@@ -258,36 +243,27 @@ function stripOf(canvas, tint, state, set) {
     if (!source) return;
     if (drawn !== state.stops) radiance();
     const context = canvas.getContext("2d");
-    const w = width();
+    const w = canvas.width;
     const left = ((((-state.turn / (2 * Math.PI)) % 1) + 1) % 1) * w;
     for (const x of [left - w, left]) context.drawImage(image, x, 0, w, canvas.height);
     const x = ((((0.5 - (azimuth + Math.PI) / (2 * Math.PI)) % 1) + 1) % 1) * w;
     const y = canvas.height;
-    const mark = (at, color, size) => {
-      context.fillStyle = color;
-      context.beginPath();
-      context.moveTo(at - size, y);
-      context.lineTo(at + size, y);
-      context.lineTo(at, y - 1.6 * size);
-      context.fill();
-    };
-    for (const at of [x - w, x, x + w])
-      for (const [color, size] of [
-        ["#000", 7],
-        ["#fff", 5],
-      ])
-        mark(at, color, size);
-    if (keys) {
-      for (const [color, size] of [
-        ["#000", 3],
-        ["#fff", 1],
-      ]) {
-        context.strokeStyle = color;
-        context.lineWidth = size;
+    // Marks are white on wider black ones.
+    for (const [color, wider] of Object.entries({ "#000": 2, "#fff": 0 })) {
+      context.fillStyle = context.strokeStyle = color;
+      const size = 5 + wider;
+      for (const at of [x - w, x, x + w]) {
         context.beginPath();
-        context.arc(place.x * w, place.y * canvas.height, 6, 0, 7);
-        context.stroke();
+        context.moveTo(at - size, y);
+        context.lineTo(at + size, y);
+        context.lineTo(at, y - 1.6 * size);
+        context.fill();
       }
+      if (!keys) continue;
+      context.lineWidth = 1 + wider;
+      context.beginPath();
+      context.arc(place.x * w, place.y * canvas.height, 6, 0, 7);
+      context.stroke();
     }
   };
   // The direction, before the light is turned, of a place in the picture.
@@ -303,7 +279,7 @@ function stripOf(canvas, tint, state, set) {
   const lamp = (way, angle, strength) => ({
     direction: way,
     angle,
-    radiance: unhex(tint.value).map((x) => x * strength),
+    radiance: unhex(tint.value).map((x) => toLinear(x) * strength),
   });
   let last = null;
   let painted = false;
@@ -372,9 +348,9 @@ function materialOf(parent, part, state, opened, set) {
   const color = (text, name, acts = () => true) => {
     if (!free[name]) return;
     const input = element("input", row(node, text), { type: "color" });
-    input.oninput = () => change({ [name]: unhex(input.value) });
+    input.oninput = () => change({ [name]: unhex(input.value).map(toLinear) });
     shows.push(() => {
-      input.value = hex(value(name));
+      input.value = hex(value(name).map(toDisplay));
       input.disabled = !acts();
     });
   };
@@ -434,9 +410,9 @@ function planeOf(parent, { across, low, high, value, change, hidden }) {
     height: edge,
     tabIndex: 0,
     title: `${across} across, ${name} up`,
+    role: "application",
+    ariaLabel: `${across} across and ${name} up; arrows move the point`,
   });
-  canvas.setAttribute("role", "application");
-  canvas.setAttribute("aria-label", `${across} across and ${name} up; arrows move the point`);
   const valueAt = (x) => (blinn ? low * (high / low) ** (1 - x) : low + x * (high - low));
   const placeOf = (v) => (blinn ? 1 - Math.log(v / low) / Math.log(high / low) : (v - low) / (high - low));
   const put = (x, y) => change({ [across]: valueAt(clamp(x, 0, 1)), f0: clamp(y, 0, 1) ** 2 });
@@ -472,15 +448,12 @@ function planeOf(parent, { across, low, high, value, change, hidden }) {
     c.lineWidth = 2;
     for (let k = 0; k <= 4; k++) {
       const at = margin + ((edge - 2 * margin) * k) / 4;
-      for (const [x0, y0, x1, y1] of [
-        [at, margin, at, edge - margin],
-        [margin, at, edge - margin, at],
-      ]) {
-        c.beginPath();
-        c.moveTo(x0, y0);
-        c.lineTo(x1, y1);
-        c.stroke();
-      }
+      c.beginPath();
+      c.moveTo(at, margin);
+      c.lineTo(at, edge - margin);
+      c.moveTo(margin, at);
+      c.lineTo(edge - margin, at);
+      c.stroke();
     }
     c.fillStyle = color("--dim");
     c.font = "20px system-ui, sans-serif";

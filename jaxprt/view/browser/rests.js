@@ -127,6 +127,7 @@ export class Rests {
       ? await inflate(buffers[0], content.width * content.height)
       : numbers(Uint16Array, buffers[0]);
     const cover = asked.transparent ? await decompressed(buffers[1]) : null;
+    if (seq !== stats.seq) return false;
     viewer.drawing.addStill(color, content.width, content.height, encoded, content.scale, cover);
     viewer.redraw();
     stats[coarse ? "coarse" : "stills"]++;

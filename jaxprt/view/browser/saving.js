@@ -21,9 +21,8 @@ const KINDS = {
 // Asks what is to be saved, and how.
 /** @param {import("./viewer.js").Viewer} viewer */
 export function dialogOf(parent, canvas, viewer) {
-  const dialog = element("dialog", parent);
+  const dialog = element("dialog", parent, { ariaLabel: "save" });
   const form = element("form", dialog, { method: "dialog" });
-  dialog.setAttribute("aria-label", "save");
   element("h2", form, { textContent: "Save" });
   const field = (text, tag, fields) => {
     const row = element("label", form, { className: "row" });
@@ -36,8 +35,7 @@ export function dialogOf(parent, canvas, viewer) {
   const height = field("height in pixels", "input", number);
   const seconds = field("seconds", "input", { ...number, max: 60, value: 4 });
   const clear = field("transparent background", "input", { type: "checkbox" });
-  const note = element("div", form, { className: "note" });
-  note.setAttribute("role", "status");
+  const note = element("div", form, { className: "note", role: "status" });
   const end = element("div", form, { className: "row end" });
   const cancel = element("button", end, { type: "button", textContent: "cancel" });
   const save = element("button", end, { type: "submit", className: "main", textContent: "save" });
@@ -50,8 +48,8 @@ export function dialogOf(parent, canvas, viewer) {
     clear.parentElement.hidden = !clears;
     seconds.parentElement.hidden = seconds.disabled = !lasting;
   };
-  let saved = null;
-  let stopped = null; // the choices of the last picture that was saved, and what gives up the present one
+  let saved = null; // the choices of what was saved last
+  let stopped = null; // what gives up the present one
   kind.onchange = show;
   cancel.onclick = () => {
     stopped?.abort();
@@ -96,22 +94,13 @@ export function dialogOf(parent, canvas, viewer) {
       if (!stopped) {
         // else the dialog was left while its picture is being made
         note.textContent = kind.textContent = "";
+        const python = viewer.scene?.rests.includes("picture");
         for (const [name, [text, { python: needs }]] of Object.entries(KINDS))
-          if (!needs || viewer.scene?.rests.includes("picture"))
-            element("option", kind, { value: name, textContent: text });
-        const {
-          transparent,
-          kind: last,
-          seconds: length,
-          ...size
-        } = saved ?? { width: canvas.width, height: canvas.height, transparent: false, kind: "png", seconds: 4 };
-        [kind.value, width.value, height.value, seconds.value, clear.checked] = [
-          last,
-          size.width,
-          size.height,
-          length,
-          transparent,
-        ];
+          if (!needs || python) element("option", kind, { value: name, textContent: text });
+        const size = { width: canvas.width, height: canvas.height };
+        const last = saved ?? { ...size, kind: "png", seconds: 4, transparent: false };
+        for (const [name, input] of Object.entries({ kind, width, height, seconds })) input.value = last[name];
+        clear.checked = last.transparent;
         show();
       }
       dialog.showModal();

@@ -6,6 +6,14 @@ import { panelOf } from "./panel.js";
 const POLL = 300; // milliseconds between questions about progress
 const FIRST = 50; // before there is a scene
 
+/** @typedef {{ name: string, vertices: number, free?: Record<string, any> }} Part */
+/**
+ * @typedef {{ version: number, scene: number, finished: boolean, vertices: number, note?: string, parts: Part[],
+ *   backs?: number, center: number[], origin: number[], radius: number, eye: number[], target: number[],
+ *   field_of_view: number, lights: string[], systems: Record<string, { bounces: boolean }>, rests: string[],
+ *   buffers: DataView<ArrayBuffer>[], position: Float32Array, face: Uint32Array }} Scene
+ */
+
 export class Scenes {
   /** @param {import("./viewer.js").Viewer} viewer */
   constructor(viewer) {
@@ -85,8 +93,8 @@ export class Scenes {
       if (viewer.closed) return;
       if (content.kind === "error") return viewer.tell(content.message);
       viewer.tell("");
-      const position = numbers(Float32Array, buffers[0]);
-      await this.show({ ...content, buffers, position, face: numbers(Uint32Array, buffers[1]) });
+      const arrays = { position: numbers(Float32Array, buffers[0]), face: numbers(Uint32Array, buffers[1]) };
+      await this.show({ ...content, buffers, ...arrays });
     } catch (error) {
       viewer.tell(`no answer from Python: ${error.message}`);
       if (!viewer.closed) setTimeout(() => this.load(), 1000);
@@ -94,6 +102,7 @@ export class Scenes {
       this.loading = false;
     }
   }
+  /** @param {Scene} loaded */
   async show(loaded) {
     const { viewer } = this;
     const { state, canvas } = viewer;

@@ -14,16 +14,11 @@ import { Colors } from "./colors.js";
 import { Rests } from "./rests.js";
 import { Scenes } from "./scenes.js";
 
+/** @typedef {{ kind: string, [field: string]: any }} Message */
 /** @typedef {{ content: any, buffers: DataView<ArrayBuffer>[] }} Answer */
-/** @typedef {(message: object, files?: ArrayBuffer[]) => Promise<Answer>} Ask */
-/** @typedef {{ name: string, vertices: number, free?: Record<string, any> }} Part */
-/** @typedef {{ center: number[], origin: number[], radius: number, eye: number[], target: number[], field_of_view: number }} Space */
-/** @typedef {{ version: number, scene: number, vertices: number, note?: string, backs?: number, parts: Part[] }} Mesh */
-/** @typedef {{ lights: string[], systems: Record<string, { bounces: boolean }>, rests: string[] }} Offers */
-/** @typedef {{ buffers: DataView<ArrayBuffer>[], position: Float32Array, face: Uint32Array }} Arrays */
-/** @typedef {Space & Mesh & Offers & Arrays} Scene */
+/** @typedef {(message: Message, files?: ArrayBuffer[]) => Promise<Answer>} Ask */
 
-// What all modules share: the state, the scene, and what they are parts of.
+// What all modules share. They change the state by `set`, and the camera by its own methods and `moved`.
 export class Viewer {
   /** @param {HTMLElement} root @param {Ask} ask @param {boolean} addressed */
   constructor(root, ask, addressed) {
@@ -37,7 +32,7 @@ export class Viewer {
     this.state = initial();
     /** @type {Camera | null} */
     this.camera = null;
-    /** @type {Scene | null} */
+    /** @type {import("./scenes.js").Scene | null} */
     this.scene = null;
     this.exposed = null; // the light that the exposure has been found for, while it is automatic
     this.notice = ""; // what stays said until the next change
