@@ -85,7 +85,8 @@ def test_the_wheel_keeps_what_is_under_the_pointer_and_angles_what_is_in_the_mid
     angle = hand.page.get_by_label("view angle °, typed")
     angle.fill("20")
     angle.press("Enter")
-    hand.settle()
+    hand.finish()
+    assert angle.input_value() == "20"
     assert hand.camera()["angle"] == pytest.approx(np.radians(20))
     size = [found["distance"] * np.tan(found["angle"] / 2) for found in (camera, hand.camera())]
     assert size[1] == pytest.approx(size[0])

@@ -112,7 +112,7 @@ export function dialogOf(parent, canvas, viewer) {
 // What is chosen as a file with its name; `told` says meanwhile how far it is.
 /** @param {import("./viewer.js").Viewer} viewer */
 async function made(viewer, choice, told, signal) {
-  const { scene, camera, state } = viewer;
+  const { scene, state } = viewer;
   const { kind } = choice;
   const json = (text) => new Blob([text], { type: "application/json" });
   if (!scene) throw new Error("there is no scene yet");
@@ -124,8 +124,8 @@ async function made(viewer, choice, told, signal) {
   }
   const quick = { ...choice, samples: 4, transparent: false };
   const frames = {
-    orbit: (share) => picture(viewer, quick, camera.around(2 * Math.PI * share)),
-    turn: (share) => picture(viewer, quick, camera, { turn: state.turn + 2 * Math.PI * share }),
+    orbit: (share) => picture(viewer, quick, viewer.camera.around(2 * Math.PI * share)),
+    turn: (share) => picture(viewer, quick, viewer.camera, { turn: state.turn + 2 * Math.PI * share }),
   };
   try {
     if (!frames[kind]) return { blob: await picture(viewer, { ...choice, format: kind }), name: `jaxprt.${kind}` };
