@@ -161,7 +161,11 @@ def test_typed_numbers_change_the_scene_and_the_sliders(hand):
     typed(hand, "rotation °", "90")
     assert hand.state()["turn"] == pytest.approx(np.pi / 2)
     assert np.abs(hand.pixels() - before).max() > 0.05
-    typed(hand, "rotation °", "270")  # once around
+    field = hand.page.get_by_label("rotation °, typed")
+    field.fill("270")  # once around
+    hand.page.evaluate(f"() => ({CANVAS}).closest('.frame').dispatchEvent(new Event('theme'))")  # shows all anew
+    field.press("Enter")
+    hand.settle()
     assert hand.state()["turn"] == pytest.approx(-np.pi / 2)
     assert hand.page.get_by_label("rotation °", exact=True).input_value() == "-90"
     typed(hand, "metallic", "7")  # as much as there is
@@ -400,10 +404,10 @@ def test_the_scene_is_shown_small_in_each_light_and_a_click_takes_it(hand, syste
     for number, button in enumerate(buttons):
         button.wait_for()
         assert button.get_attribute("aria-pressed") == str(number == 0).lower()
-    small = hand.page.evaluate(
-        f"""() => [...{ROOT}.querySelectorAll(".gallery canvas")].map((canvas) =>
-            Array.from(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data))"""
-    )
+    read = f"""[...{ROOT}.querySelectorAll(".gallery canvas")].map((canvas) =>
+        Array.from(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data))"""
+    hand.page.wait_for_function(f"() => {read}.every((pixel) => pixel[3])")
+    small = hand.page.evaluate(f"() => {read}")
     camera = hand.camera()
     eye = Camera(camera["eye"], camera["target"], [0.0, 1.0, 0.0], camera["angle"], 72, 54)
     cover = np.asarray(systems["lobes"].coverage(eye)) == 1

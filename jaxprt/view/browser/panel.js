@@ -4,6 +4,7 @@ import { clamp, dot, element, half, hex, toDisplay, toLinear, unhex } from "./co
 import { BACKGROUNDS, TONES } from "./drawing.js";
 import { openFiles } from "./files.js";
 
+export const SMALL = { width: 72, height: 54 }; // pixels of the pictures of lights
 const MANY = 3; // parts up to which all of their controls are open at first; of more, the first
 const FILTER = 10; // parts up to which one is open at first; of more, names can be searched
 const DEGREE = Math.PI / 180;
@@ -33,7 +34,15 @@ function slider(
   const range = element("input", node, { type: "range", ariaLabel: text, ...steps });
   const number = element("input", node, { type: "number", step: 10 ** -digits, ariaLabel: `${text}, typed` });
   range.oninput = () => pick(at(Number(range.value)));
+  let typing = false; // what is typed stays until it is taken
+  number.oninput = () => {
+    typing = true;
+  };
+  number.onblur = () => {
+    typing = false;
+  };
   number.onchange = () => {
+    typing = false;
     if (number.value !== "" && Number.isFinite(Number(number.value))) pick(wrap(Number(number.value)));
     node.show(node.value, !number.disabled);
   };
@@ -45,7 +54,7 @@ function slider(
     range.disabled = number.disabled = !acts;
     const shown = String(Number(value.toFixed(digits)));
     if (range.value !== String(of(value))) range.value = of(value);
-    if (number.value !== shown) number.value = shown;
+    if (!typing && number.value !== shown) number.value = shown;
     range.ariaValueText = shown;
   };
   return node;
@@ -80,6 +89,13 @@ export function panelOf(viewer) {
   const light = choice(lightPart, "light", scene.lights, (i) => set({ light: i }));
   const gallery = element("div", lightPart, { className: "gallery", hidden: true, role: "group" });
   gallery.ariaLabel = "the scene in each light";
+  // Room for a picture from the start on: what is below must not move under a hand.
+  const pictured = () => {
+    const number = gallery.children.length;
+    const name = scene.lights[number];
+    const act = { onclick: () => set({ light: number }), ariaLabel: `light: ${name}` };
+    element("canvas", element("button", gallery, { type: "button", title: name, ...act }), SMALL);
+  };
   const sides = { low: -180, high: 180, step: 1, digits: 1, wrap: (x) => ((((x + 180) % 360) + 360) % 360) - 180 };
   const turn = slider(lightPart, "rotation °", sides, (degrees) => set({ turn: degrees * DEGREE }));
   const sky = element("canvas", lightPart, {
@@ -166,6 +182,8 @@ export function panelOf(viewer) {
     show() {
       if (light.length !== scene.lights.length) light.fill(scene.lights);
       light.value = state.light;
+      while (scene.rests.length && gallery.children.length < scene.lights.length) pictured();
+      gallery.hidden = gallery.children.length < 2;
       [...gallery.children].forEach((button, i) => (button.ariaPressed = String(i === state.light)));
       turn.show(sides.wrap(state.turn / DEGREE));
       if (system) system.value = names.indexOf(state.system);
@@ -180,21 +198,13 @@ export function panelOf(viewer) {
       strip.show();
     },
     // Shows a picture of the scene in a light, RGBA from below, in whose place a click puts the light.
-    thumbnail(number, pixel, width, height) {
-      while (gallery.children.length <= number) {
-        const at = gallery.children.length;
-        const name = scene.lights[at];
-        const act = { onclick: () => set({ light: at }), ariaLabel: `light: ${name}` };
-        const button = element("button", gallery, { type: "button", title: name, ...act });
-        element("canvas", button, { width, height });
-      }
+    thumbnail(number, pixel) {
+      const { width, height } = SMALL;
       const context = gallery.children[number].firstChild.getContext("2d");
       const image = context.createImageData(width, height);
       for (let y = 0; y < height; y++)
         image.data.set(pixel.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
       context.putImageData(image, 0, 0);
-      gallery.hidden = false;
-      this.show();
     },
     paint: strip.paint,
     // Where the camera stands, and how wide it sees.

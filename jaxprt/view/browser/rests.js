@@ -1,10 +1,10 @@
 // What comes while nothing moves: the light as it is seen, pictures at pixels, and small pictures of the other lights.
 
 import { decompressed, inflate, numbers } from "./common.js";
+import { SMALL } from "./panel.js";
 
 const PATIENT = 250; // milliseconds without a change after which a rest begins
 const SLOW_PICTURE = 500; // milliseconds of a whole picture from which on a coarse one comes first
-const SMALL = { width: 72, height: 54 }; // pixels of the pictures of lights in the panel
 const SKY_ROWS = 1024; // of the picture of a light at rest, if its file has so many
 
 export class Rests {
@@ -72,7 +72,7 @@ export class Rests {
         const color = numbers(Uint16Array, buffers[0]);
         const { camera, state } = viewer;
         small.set(light, viewer.drawing.thumbnail(camera, state, scene.center, SMALL, [color, content.scale]));
-        viewer.controls?.thumbnail(light, small.get(light), SMALL.width, SMALL.height);
+        viewer.controls?.thumbnail(light, small.get(light));
         viewer.redraw();
       } catch {
         return;
