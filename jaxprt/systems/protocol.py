@@ -23,7 +23,6 @@ from jaxprt.scene import origin as origins
 from jaxprt.scene.environment import Environment
 from jaxprt.scene.points import VERTICES, Points, placed
 
-SEEN = 8  # cells along the edge of a cube's face whose visibility is exported for highlights
 CHANNELS = 4  # most channels of a BRDF's table that exported pages hold
 _KNOTS = 64  # most knots of its parameter
 # Bytes of what lights of a batch become at all vertices together, and of one at a vertex: some dozen terms of 3 colors.
@@ -225,11 +224,6 @@ class Exported(eqx.Module):
     def diffuse(self) -> Float[np.ndarray, "lm v"]:
         """Transfer vectors of an ideally diffuse response, in spherical harmonics."""
         return self.vector
-
-    @property
-    def cells(self) -> Float[np.ndarray, "n v"]:
-        """Visible share of each of `SEEN` x `SEEN` cells of the faces of a cube; none for ideally diffuse surfaces."""
-        return np.zeros((0, self.vector.shape[1]))
 
     @property
     def light_size(self) -> int:

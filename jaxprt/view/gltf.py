@@ -22,24 +22,19 @@ from jaxprt.relit.channels import Shading
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, Part, TexturedMaterial
 from jaxprt.scene.material import Texture
-from jaxprt.sphere import cubemap, harmonics
+from jaxprt.sphere import harmonics
 from jaxprt.systems import axes, protocol
 from jaxprt.view.stages import counterclockwise
 
 DEGREE = 3  # of the transfer: 16 harmonics in four attributes
 MOST_DEGREE = 5  # up to which coefficients are below 1, and attributes at most nine
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
-_KINDS = {"<f4": 5126, "<u4": 5125, "<i2": 5122, "<i1": 5120}
+_KINDS = {"<f4": 5126, "<u4": 5125, "<i2": 5122}
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _VERTICES, _INDICES = 34962, 34963
 _WRAPS = {"repeat": 10497, "mirror": 33648, "clamp": 33071}
 _GRAY = 0.5  # base color of materials that glTF does not have
-_SHORT, _BYTE = 32767, 127
-_SEEN_DEGREE = 2  # of the visibility: 9 harmonics in three attributes
-_HORIZON = 0.12  # least cosine of the centers of cells that are all above the horizon
-_SMOOTH = 1e-3  # of the squared Laplacian of the visibility, relative to its squared error
-_TINY = 1e-9  # where no cell is above the horizon
-_ROWS = 4096  # vertices whose visibility is fitted at once
+_SHORT = 32767
 
 
 class _File:
@@ -154,16 +149,10 @@ def export_gltf(
     for number, (part, shading) in enumerate(zip(scene.scene.parts, scene.shading, strict=True)):
         attributes, material = _attributes(file, part), _material(file, part, shading)
         if degree is not None:
-            system = axes.map_leaves(scene.part_system(number), lambda _, leaf: put(leaf))
-            exported = system.exported(f"part {part.name!r}")
-            transfer = _transfer(exported, part.name, degree)
+            transfer = _transfer(scene, number, degree)
             for first in range(0, transfer.shape[1], 4):
                 column = np.round(_SHORT * transfer[:, first : first + 4])
                 attributes[f"_PRT_{first // 4}"] = file.array(column, "<i2", normalized=True)
-            seen = _visibility(exported, np.asarray(part.mesh.normal, float))
-            for first in range(0, seen.shape[1], 4):
-                column = np.round(_BYTE * seen[:, first : first + 4])
-                attributes[f"_PRT_SEEN_{first // 4}"] = file.array(column, "<i1", normalized=True)
         attributes |= material.pop("coordinates")
         _add_node(file, part, part.name, attributes, file.add("materials", material | {"name": part.name}))
     if degree is None:
@@ -173,7 +162,6 @@ def export_gltf(
     prt = {
         "degree": degree,
         "attributes": [f"_PRT_{number}" for number in range(-(-((degree + 1) ** 2) // 4))],
-        "visibility": [f"_PRT_SEEN_{number}" for number in range(-(-((_SEEN_DEGREE + 1) ** 2) // 4))],
         "radiance": "diffuse color times the sum of attributes times coefficients of the light",
         "basis": "real orthonormal spherical harmonics without Condon-Shortley phase, k = l (l + 1) + m, polar axis +z",
         "axes": "those of this file",
@@ -187,37 +175,15 @@ def _light(light: Environment, degree: int) -> Float[np.ndarray, "lm 3"]:
     return np.broadcast_to(coefficient, (len(coefficient), 3))
 
 
-def _transfer(exported: protocol.Exported, name: str, degree: int) -> Float[np.ndarray, "v k"]:
+def _transfer(scene: RelitScene, number: int, degree: int) -> Float[np.ndarray, "v k"]:
     """Transfer of the diffuse response of a part's vertices, padded to whole attributes."""
-    vector, count = exported.diffuse, (degree + 1) ** 2
+    name, count = scene.scene.names[number], (degree + 1) ** 2
+    system = axes.map_leaves(scene.part_system(number), lambda _, leaf: put(leaf))
+    vector = system.exported(f"part {name!r}").diffuse
     if len(vector) < count:
         most = harmonics.degree_of(len(vector))
         raise ValueError(f"degree must be at most {most}, that of the transfer of part {name!r}, got {degree}")
     return np.pad(vector[:count].T, ((0, 0), (0, -count % 4)))
-
-
-def _visibility(exported: protocol.Exported, normal: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v k"]:
-    """Visibility above the horizon of a part's vertices in harmonics, as they are stored; no columns without lobes.
-
-    Below the horizon the fit is free. A vertex that sees all of its hemisphere has a visibility of 1 everywhere, and that
-    of others has no step at the horizon.
-    """
-    seen = exported.cells
-    if not len(seen):
-        return np.zeros((len(normal), 0))
-    direction, area = (np.asarray(of(size=protocol.SEEN), float) for of in (cubemap.direction, cubemap.solid_angle))
-    direction = direction.reshape(-1, 3)
-    basis = np.sqrt(4 * np.pi) * np.asarray(harmonics.evaluate(jnp.asarray(direction), degree=_SEEN_DEGREE), float)
-    square = (basis[:, :, None] * basis[:, None]).reshape(len(basis), -1)
-    band = np.repeat(np.arange(_SEEN_DEGREE + 1), 2 * np.arange(_SEEN_DEGREE + 1) + 1)
-    smooth = np.diag(4 * np.pi * (_SMOOTH * (band * (band + 1.0)) ** 2 + _TINY))
-    rows = []
-    for first in range(0, len(normal), _ROWS):
-        cosine = normal[first : first + _ROWS] @ direction.T
-        weight = np.where(cosine > _HORIZON, area.ravel() * cosine, 0)
-        normal_matrix = (weight @ square).reshape(-1, *smooth.shape) + smooth
-        rows.append(np.linalg.solve(normal_matrix, (weight * seen[:, first : first + _ROWS].T @ basis)[..., None]))
-    return np.pad(np.clip(np.concatenate(rows)[..., 0], -1, 1), ((0, 0), (0, -basis.shape[1] % 4)))
 
 
 def _attributes(file: _File, part: Part) -> dict[str, int]:

@@ -9,6 +9,7 @@ import pathlib
 import shutil
 import struct
 import subprocess
+import tarfile
 import threading
 
 import equinox as eqx
@@ -22,7 +23,8 @@ from jaxprt import view
 from jaxprt.scene import Camera, Environment, Part, Scene, Texture, TexturedMaterial, builtin
 from jaxprt.sphere import cubemap, harmonics
 
-EXAMPLE = pathlib.Path(__file__).parents[2] / "examples/three_prt.html"
+ROOT = pathlib.Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples/three_prt.html"
 DEGREE, SIZE = 3, 16
 VALIDATE = """
 const validator = require("gltf-validator"), fs = require("fs");
@@ -31,9 +33,11 @@ validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[1]))).then((
 });
 """
 # Renders into floats: linear radiance, and alpha where there is a surface.
-RENDER = """async ({ eye, target, angle, edge }) => {
-  const { THREE, renderer, scene, camera } = window;
+RENDER = """async ({ eye, target, angle, edge, name }) => {
+  const { THREE, renderer } = window;
+  const scene = window[name];
   renderer.setAnimationLoop(null);
+  renderer.setScissorTest(false);
   scene.background = null;
   renderer.setClearColor(0, 0);
   const buffer = new THREE.WebGLRenderTarget(edge, edge, { type: THREE.FloatType });
@@ -134,11 +138,17 @@ def test_attributes_times_the_light_are_the_diffuse_radiance(path, relit, light)
         start += count
 
 
-def test_transfer_of_matrices_is_that_of_vectors(relit, tmp_path):
-    glossy = TexturedMaterial(base_color=(0.6, 0.2, 0.1), metallic=0.0, roughness=0.5)
-    parts = [dataclasses.replace(part, material=glossy) for part in relit.scene.parts]
-    made = prt.precompute(Scene(parts), refine=False, system=prt.relit.Harmonics(DEGREE), size=SIZE, progress=False)
-    view.export_gltf(made, tmp_path / "glossy.glb", degree=2)
+@pytest.fixture(scope="module")
+def metal(relit):
+    """The same scene of metal, by transfer matrices."""
+    material = TexturedMaterial(base_color=(0.9, 0.8, 0.7), metallic=1.0, roughness=0.4)
+    parts = [dataclasses.replace(part, material=material) for part in relit.scene.parts]
+    scene = Scene(parts, cameras=relit.scene.cameras)
+    return prt.precompute(scene, refine=False, system=prt.relit.Harmonics(DEGREE), size=SIZE, progress=False)
+
+
+def test_transfer_of_matrices_is_that_of_vectors(relit, metal, tmp_path):
+    view.export_gltf(metal, tmp_path / "glossy.glb", degree=2)
     view.export_gltf(relit, tmp_path / "matte.glb", degree=2)
     found, true = (content(tmp_path / name) for name in ("glossy.glb", "matte.glb"))
     first, second = (
@@ -148,7 +158,7 @@ def test_transfer_of_matrices_is_that_of_vectors(relit, tmp_path):
     # Matrices of degree 3 leave out the fourth band of the cosine.
     assert np.linalg.norm(first - second) < 0.05 * np.linalg.norm(second)
     with pytest.raises(ValueError, match="degree must be at most 3, that of the transfer of part 'textured', got 4"):
-        view.export_gltf(made, tmp_path / "a.glb", degree=4)
+        view.export_gltf(metal, tmp_path / "a.glb", degree=4)
 
 
 def test_others_read_the_file_and_jaxprt_its_materials(path, relit):
@@ -196,13 +206,40 @@ def test_validator_of_khronos_has_no_objections(path, node_modules):
     assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
 
 
+@pytest.fixture(scope="session")
+def package():
+    """The package that `make three` makes of the module."""
+    command = ["make", "--old-file=.venv/.setup-test", "three"]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    return ROOT / f"build/jaxprt-three-{prt.__version__}.tgz"
+
+
+def test_the_package_has_two_small_modules_and_needs_three_alone(package):
+    with tarfile.open(package) as archive:
+        sizes = {member.name: member.size for member in archive}
+        file = archive.extractfile("package/package.json")
+        assert file is not None
+        about = json.load(file)
+    modules = {"package/three.js", "package/harmonics.js"}
+    assert sizes.keys() == modules | {"package/LICENSE", "package/README.md", "package/package.json"}
+    assert sum(sizes[name] for name in modules) < 15_000
+    assert package.stat().st_size < 15_000
+    assert list(about["peerDependencies"]) == ["three"]
+    assert about["version"] == prt.__version__
+    assert not about.keys() & {"dependencies", "scripts"}
+
+
 @pytest.fixture
-def served(path, node_modules):
-    """Address of the example beside the file and three.js."""
+def served(path, node_modules, package):
+    """Address of the example beside the file, three.js and the module as it is packed."""
     folder = path.parent
     shutil.copy(EXAMPLE, folder)
     if not (folder / "node_modules").exists():
-        (folder / "node_modules").symlink_to(node_modules)
+        (folder / "node_modules").mkdir()
+        (folder / "node_modules/three").symlink_to(node_modules / "three")
+        with tarfile.open(package) as archive:
+            archive.extractall(folder / "node_modules", filter="data")
+        (folder / "node_modules/package").rename(folder / "node_modules/jaxprt-three")
 
     class Quiet(http.server.SimpleHTTPRequestHandler):
         def log_message(self, *_):
@@ -215,29 +252,115 @@ def served(path, node_modules):
     server.server_close()
 
 
-def test_three_js_relights_the_file_as_jaxprt_does(browser, served, relit, light):
-    tab, camera = browser.new_page(), relit.camera
-    told = []
-    tab.on("pageerror", lambda error: told.append(str(error)))
-    tab.goto(f"{served}?scene=prt.glb")
-    tab.wait_for_function("() => window.scene")
-    shot = {"eye": np.asarray(camera.eye).tolist(), "target": np.asarray(camera.target).tolist(), "edge": camera.width}
+@pytest.fixture
+def opened(browser, served):
+    """A function that opens the example with a file. Errors of scripts and shaders fail the test."""
+    tab, errors = browser.new_page(), []
+    tab.set_default_timeout(180_000)
+    tab.on("pageerror", lambda error: errors.append(str(error)))
+    tab.on("console", lambda said: "THREE." in said.text and errors.append(said.text))
+
+    def go(name):
+        tab.goto(f"{served}?scene={name}")
+        tab.wait_for_function("() => window.light")
+        return tab
+
+    yield go
+    tab.close()
+    assert not errors
+
+
+def drawn(tab, camera, name="scene"):
+    """Linear radiance and alpha of a scene of the page."""
+    shot = {key: np.asarray(getattr(camera, key)).tolist() for key in ("eye", "target")}
+    angle = float(np.degrees(camera.field_of_view))
+    data = tab.evaluate(RENDER, shot | {"angle": angle, "edge": camera.width, "name": name})
+    return np.array(data).reshape(camera.height, camera.width, 4)[::-1]
+
+
+def test_three_js_relights_the_file_as_jaxprt_does(opened, relit, light):
+    tab, camera = opened("prt.glb"), relit.camera
     for degrees in (0, 90):
         tab.evaluate(
             "(value) => { const turn = document.getElementById('turn'); turn.value = value; turn.oninput(); }", degrees
         )
-        data = tab.evaluate(RENDER, shot | {"angle": float(np.degrees(camera.field_of_view))})
-        found = np.array(data).reshape(camera.height, camera.width, 4)[::-1]
+        found = drawn(tab, camera)
         turn = view.stages.about(np.radians(degrees))
         rotated = prt.scene.environment.rotate(light, turn)
         true = np.asarray(relit.picture(rotated, samples=1, shadows="vertices"))
         shown = (found[..., 3] > 0.5) & (np.asarray(relit.coverage(samples=1)) > 0.5)
         assert shown.mean() > 0.3
         off = np.linalg.norm((found[..., :3] - true)[shown], axis=1)
-        # A few pixels at edges see another part.
+        # A few pixels at edges see another part. The environment, which is set, adds nothing to the transfer.
         assert np.quantile(off, 0.98) < 0.02 * np.linalg.norm(true[shown], axis=1).mean()
-    assert not told
-    tab.close()
+
+
+def test_a_light_of_a_texture_is_that_of_its_coefficients(opened, relit, light):
+    tab, rows, columns = opened("prt.glb"), 64, 128
+    latitude, longitude = np.meshgrid(
+        np.pi * (0.5 - (np.arange(rows) + 0.5) / rows),
+        np.pi * (1 - 2 * (np.arange(columns) + 0.5) / columns),
+        indexing="ij",
+    )
+    across = np.cos(latitude)
+    direction = np.stack([across * np.sin(longitude), np.sin(latitude), across * np.cos(longitude)], -1)
+    coefficient = np.array(harmonics.project(light.radiance, degree=DEGREE))
+    coefficient[0] += 2  # nowhere negative
+    radiance = np.asarray(harmonics.evaluate(jnp.asarray(direction), degree=DEGREE)) @ coefficient
+    assert radiance.min() > 0
+    tab.evaluate("(rows) => light.set(rows)", coefficient.tolist())
+    known = drawn(tab, relit.camera)[..., :3]
+    for half, flip in ((False, False), (True, True)):
+        picture = np.concatenate([radiance, np.ones((rows, columns, 1))], -1)
+        tab.evaluate(
+            """([data, half, flip]) => {
+              const type = half ? THREE.HalfFloatType : THREE.FloatType;
+              const values = half ? Uint16Array.from(data, THREE.DataUtils.toHalfFloat) : Float32Array.from(data);
+              const texture = new THREE.DataTexture(values, 128, 64, THREE.RGBAFormat, type);
+              texture.flipY = flip;
+              texture.needsUpdate = true;
+              light.set(texture);
+            }""",
+            [(picture if flip else picture[::-1]).ravel().tolist(), half, flip],
+        )
+        found = drawn(tab, relit.camera)[..., :3]
+        assert np.linalg.norm(found - known) < 2e-3 * np.linalg.norm(known)
+
+
+def test_highlights_are_darker_where_something_hides_the_light_and_else_as_they_are(opened, path, metal, light):
+    view.export_gltf(metal, path.with_name("metal.glb"), environments={"soft": light})
+    tab = opened("metal.glb")
+    tab.evaluate("light.set(Array.from({ length: 16 }, (_, k) => [k ? 0 : 3, k ? 0 : 3, k ? 0 : 3]))")
+    tab.evaluate("plain.environment = scene.environment")
+    found, plain = (drawn(tab, metal.camera, name) for name in ("scene", "plain"))
+    share = (found / np.maximum(plain, 1e-6))[..., 0][plain[..., 3] > 0.5]
+    assert share.max() < 1.02
+    assert np.quantile(share, 0.7) > 0.95
+    assert np.quantile(share, 0.05) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        ("light.set('grace')", "the light must be one of soft, got grace"),
+        ("light.set([[1, 1, 1]])", "the light must have 16 coefficients, got 1"),
+        ("light.set(new THREE.Texture())", "the texture must have floats or half floats"),
+        (
+            """import("jaxprt-three").then(({ relight }) => {
+              const geometry = new THREE.BufferGeometry();
+              for (let i = 0; i < 17; i++) geometry.setAttribute(`a${i}`, new THREE.Float32BufferAttribute([0], 1));
+              const extras = { prt: { degree: 3, attributes: ["_PRT_0"], lights: {} } };
+              relight({ scene: new THREE.Mesh(geometry, new THREE.MeshStandardMaterial()), asset: { extras } }, scene);
+            })""",
+            "a mesh must have at most 16 attributes of vertices, got 17: export with a smaller --degree",
+        ),
+    ],
+)
+def test_the_module_refuses_what_it_cannot_show(opened, call, message):
+    tab = opened("prt.glb")
+    assert message in tab.evaluate(
+        f"async () => {{ try {{ await {call}; }} catch (error) {{ return error.message; }} }}"
+    )
 
 
 def test_a_file_without_transfer_is_told(browser, served, path, relit, light):

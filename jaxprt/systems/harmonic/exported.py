@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxprt.files.inputs import JsonObject
-from jaxprt.sphere import cubemap, harmonics
+from jaxprt.sphere import harmonics
 from jaxprt.systems.harmonic.table import HarmonicBrdf
 from jaxprt.systems.harmonic.transfer import TransferMatrix, from_visibility, to_visibility
-from jaxprt.systems.protocol import CHANNELS, SEEN, Exported, System
+from jaxprt.systems.protocol import CHANNELS, Exported, System
 
 _EQUAL = 1e-3  # largest relative error at which matrices count as products of a visibility, and tables as symmetric
 
@@ -57,13 +57,6 @@ class ExportedMatrices(Exported):
         zonal = np.arange(self.system.degree + 1)
         matrix = np.asarray(self.system.transport.matrix, np.float64)[:, 0]
         return np.einsum("l,vli->iv", upright_cosine(self.system.degree), matrix[:, zonal * (zonal + 1)])
-
-    @property
-    def cells(self) -> Float[np.ndarray, "n v"]:
-        """Visible share of each cell of the faces, from the harmonics of the visibility."""
-        direction = cubemap.direction(size=SEEN).reshape(-1, 3)
-        value = harmonics.evaluate(direction, degree=2 * self.degree)
-        return np.clip(np.asarray(value, np.float32) @ self.visible, 0, 1)
 
     @property
     def degree(self) -> int:

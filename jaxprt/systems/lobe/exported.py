@@ -14,7 +14,7 @@ from jaxprt.scene.points import VERTICES
 from jaxprt.systems.lobe import pyramid
 from jaxprt.systems.lobe.pyramid import LobeTransport, Scales
 from jaxprt.systems.lobe.table import LobeBrdf
-from jaxprt.systems.protocol import CHANNELS, SEEN, Exported, System
+from jaxprt.systems.protocol import CHANNELS, Exported, System
 
 DEGREE = 6  # of the harmonics by which pages light diffuse parts
 _LIGHT = 64  # most texels along a face's edge of the light that lobes read
@@ -60,11 +60,6 @@ class ExportedLobes(Exported):
     def channels(self) -> int:
         """Number of channels of the table."""
         return len(self.brdf.weight)
-
-    @property
-    def cells(self) -> Float[np.ndarray, "n v"]:
-        """Visible share of each cell of the faces, from the pyramids."""
-        return np.asarray(self.system.transport.cells(jnp.arange(6 * SEEN**2), edge=SEEN), np.float32)
 
     @property
     def light_size(self) -> int:

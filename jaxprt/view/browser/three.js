@@ -14,7 +14,8 @@ import { gauss, harmonics } from "./harmonics.js";
 const SLOTS = 16; // attributes of a vertex that every implementation of WebGL 2 has
 const HEIGHT = 128; // rows of the environment of a light that is given by coefficients
 const MOST = 65504; // of half floats
-const [BLUR, MIDDLE] = [0.55, 0.4]; // of visibility in harmonics of degree 2: width in radians, and value at an edge
+const SEEN = 16; // harmonics of transfer that highlights read
+const [BLUR, MIDDLE] = [0.45, 0.4]; // of the visibility that they give: width in radians, and value at an edge
 // three.js has +x in the middle of a latitude-longitude picture, jaxprt +z.
 const QUARTER = -Math.PI / 2;
 
@@ -89,35 +90,33 @@ function turned(coefficients, degree, angle) {
   return result;
 }
 
-// Shader code that lights a material by the transfer of its vertices. What three.js takes for the irradiance of the
-// environment is replaced, so that its own formulas share light between the diffuse part and the highlights. Normal maps
-// change irradiance as they would without shadows.
-function patch(material, { attributes, visibility, terms }, uniforms) {
-  const names = [...attributes, ...visibility];
-  const product = (name, k) => `${name(k >> 2)}.${"xyzw"[k & 3]}`;
-  const sum = Array.from({ length: terms }, (_, k) => `${product((i) => attributes[i], k)} * prtLight[${k}]`);
-  const varying = ["varying vec3 prtRadiance;", ...visibility.map((_, i) => `varying vec4 prtVisible${i};`)].join("\n");
-  const seen = (k) => product((i) => `prtVisible${i}`, k);
-  material.onBeforeCompile = (shader) => {
-    Object.assign(shader.uniforms, uniforms);
-    shader.vertexShader = shader.vertexShader
-      .replace(
-        "#include <common>",
-        `#include <common>
-${names.map((name) => `attribute vec4 ${name};`).join("\n")}
-uniform vec3 prtLight[${terms}];
-${varying}`,
-      )
-      .replace(
-        "#include <begin_vertex>",
-        `#include <begin_vertex>
-prtRadiance = ${sum.join(" + ")};
-${visibility.map((name, i) => `prtVisible${i} = ${name};`).join("\n")}`,
-      );
-    shader.fragmentShader = shader.fragmentShader.replace("#include <common>", `#include <common>\n${varying}`).replace(
-      "#include <lights_fragment_maps>",
-      `#include <lights_fragment_maps>
-vec3 prtIrradiance = PI * prtRadiance;
+// The first harmonics of a direction d.
+const BASIS = [
+  "0.28209479",
+  "0.48860251 * d.y",
+  "0.48860251 * d.z",
+  "0.48860251 * d.x",
+  "1.09254843 * d.x * d.y",
+  "1.09254843 * d.y * d.z",
+  "0.31539157 * (3. * d.z * d.z - 1.)",
+  "1.09254843 * d.x * d.z",
+  "0.54627422 * (d.x * d.x - d.y * d.y)",
+  "0.59004359 * d.y * (3. * d.x * d.x - d.y * d.y)",
+  "2.89061144 * d.x * d.y * d.z",
+  "0.45704580 * d.y * (5. * d.z * d.z - 1.)",
+  "0.37317633 * d.z * (5. * d.z * d.z - 3.)",
+  "0.45704580 * d.x * (5. * d.z * d.z - 1.)",
+  "1.44530572 * d.z * (d.x * d.x - d.y * d.y)",
+  "0.59004359 * d.x * (d.x * d.x - 3. * d.y * d.y)",
+];
+const COSINE = ["0.25", "0.5 * c", "0.15625 * (3. * c * c - 1.)"]; // series of max(c, 0)
+
+// The light that arrives at a pixel. The visible share of the highlight's lobe is that of the transfer in its direction
+// to the transfer without shadows. Their harmonics are blurred, as by a lobe of the width BLUR: across the edge of an
+// occluder, a narrower lobe has the same middle and a steeper slope.
+const arriving = (terms) => {
+  const seen = BASIS.slice(0, terms).map((basis, k) => `prtTransfer${k >> 2}.${"xyzw"[k & 3]} * ${basis}`);
+  return `vec3 prtIrradiance = PI * prtRadiance;
 #ifdef USE_ENVMAP
   prtIrradiance *= envMapIntensity;
   #ifdef USE_NORMALMAP_TANGENTSPACE
@@ -125,28 +124,46 @@ vec3 prtIrradiance = PI * prtRadiance;
   #endif
 #endif
 iblIrradiance = prtIrradiance;
-${visibility.length ? highlight(seen) : ""}`,
-    );
-  };
-  material.customProgramCacheKey = () => `jaxprt ${terms} ${names}`;
-  material.needsUpdate = true;
-}
-
-// Scales the light of the highlight by the visible share of its lobe. The harmonics of the visibility are blurred, as by
-// a lobe of the width BLUR: across the edge of an occluder, a narrower lobe has the same middle and a steeper slope.
-const highlight = (seen) => `{
+{
   vec3 d = normalize(mix(reflect(-geometryViewDir, geometryNormal), geometryNormal, pow4(material.roughness)));
+  float c = dot(nonPerturbedNormal, d);
   d = (vec4(d, 0.) * viewMatrix).xyz;
-  float width = max(2. * pow4(material.roughness), EPSILON);
-  vec3 band = exp(-width * vec3(0., 2., 6.) / 2.);
-  float share = ${seen(0)}
-    + band.y * sqrt(3.) * dot(vec3(${seen(1)}, ${seen(2)}, ${seen(3)}), d.yzx)
-    + band.z * sqrt(15.) * dot(vec4(${seen(4)}, ${seen(5)}, ${seen(7)}, ${seen(8)}),
-      vec4(d.xyx * d.yzz, (d.x * d.x - d.y * d.y) / 2.))
-    + band.z * sqrt(5.) * ${seen(6)} * (3. * d.z * d.z - 1.) / 2.;
+  float share = PI * (${seen.join(" + ")}) / max(${COSINE.slice(0, Math.sqrt(terms)).join(" + ")}, 0.06);
+  float width = max(2. * pow4(material.roughness), EPSILON); // variance of the lobe along an axis
   radiance *= clamp((share - ${MIDDLE}) * sqrt(1. + ${BLUR ** 2} / width) + ${MIDDLE}, 0., 1.);
 }`;
+};
 
+// Shader code that lights a material by the transfer of its vertices. What three.js takes for the irradiance of the
+// environment is replaced, so that its own formulas share light between the diffuse part and the highlights. Normal maps
+// change irradiance as they would without shadows.
+function patch(material, attributes, terms, uniforms) {
+  const sum = Array.from({ length: terms }, (_, k) => `${attributes[k >> 2]}.${"xyzw"[k & 3]} * prtLight[${k}]`);
+  const passed = attributes.slice(0, Math.ceil(Math.min(terms, SEEN) / 4));
+  const varying = `varying vec3 prtRadiance;\nvarying vec4 ${passed.map((_, i) => `prtTransfer${i}`).join(", ")};`;
+  material.onBeforeCompile = (shader) => {
+    Object.assign(shader.uniforms, uniforms);
+    shader.vertexShader = shader.vertexShader
+      .replace(
+        "#include <common>",
+        `#include <common>
+attribute vec4 ${attributes.join(", ")};
+uniform vec3 prtLight[${terms}];
+${varying}`,
+      )
+      .replace(
+        "#include <begin_vertex>",
+        `#include <begin_vertex>
+prtRadiance = ${sum.join(" + ")};
+${passed.map((name, i) => `prtTransfer${i} = ${name};`).join("\n")}`,
+      );
+    shader.fragmentShader = shader.fragmentShader
+      .replace("#include <common>", `#include <common>\n${varying}`)
+      .replace("#include <lights_fragment_maps>", `#include <lights_fragment_maps>\n${arriving(terms)}`);
+  };
+  material.customProgramCacheKey = () => `jaxprt ${terms}`;
+  material.needsUpdate = true;
+}
 // The light of a file's scene in three.js, which drives the environment of `scene` too.
 class Light {
   #about;
@@ -197,22 +214,18 @@ class Light {
 export function relight(gltf, scene) {
   const about = gltf.asset.extras?.prt;
   if (!about) throw new Error("the file must have transfer in vertex attributes, from jaxprt export --format gltf");
+  const attributes = about.attributes.map((name) => name.toLowerCase());
   const terms = (about.degree + 1) ** 2;
   const value = new Float32Array(3 * terms);
   const patched = new Set();
-  gltf.scene.traverse((mesh) => {
-    if (!mesh.isMesh || patched.has(mesh.material)) return;
-    const names = Object.keys(mesh.geometry.attributes);
-    if (names.length > SLOTS)
+  gltf.scene.traverse(({ name, isMesh, geometry, material }) => {
+    const count = isMesh ? Object.keys(geometry.attributes).length : 0;
+    if (count > SLOTS)
       throw new Error(
-        `${mesh.name || "a mesh"} must have at most ${SLOTS} attributes of vertices, got ${names.length}: ` +
-          "export with a smaller --degree",
+        `${name || "a mesh"} must have at most ${SLOTS} attributes of vertices, got ${count}: export with a smaller --degree`,
       );
-    const [attributes, visibility] = [about.attributes, about.visibility].map((wanted) =>
-      wanted.map((name) => name.toLowerCase()).filter((name) => names.includes(name)),
-    );
-    patch(mesh.material, { attributes, visibility, terms }, { prtLight: { value } });
-    patched.add(mesh.material);
+    if (isMesh && !patched.has(material)) patch(material, attributes, terms, { prtLight: { value } });
+    patched.add(material);
   });
   return new Light(about, scene, value);
 }
