@@ -262,7 +262,7 @@ def opened(browser, served):
 
     def go(name):
         tab.goto(f"{served}?scene={name}")
-        tab.wait_for_function("() => window.light")
+        tab.wait_for_function("() => window.renderer")
         return tab
 
     yield go
