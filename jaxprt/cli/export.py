@@ -15,7 +15,7 @@ from jaxprt.relit import RelitScene
 from jaxprt.relit.build import precompute
 from jaxprt.scene import Environment, light_probe
 from jaxprt.scene.light_probes import TOOLS
-from jaxprt.view import export, export_baked, export_gltf, gltf, page_error
+from jaxprt.view import browser, export, export_baked, export_gltf, gltf, page_error
 
 _KINDS = {".html": "page", ".glb": "baked", ".json": "probes"}
 
@@ -128,6 +128,7 @@ def _write(
     if chosen.format == "gltf":
         export_gltf(scene, path, environments=lights, degree=chosen.degree)
         text = f", with transfer of degree {chosen.degree} in vertex attributes, and lights {', '.join(lights)}"
+        text += f"\n  relight it in three.js by {browser.FOLDER / 'three.js'}"
         return "transfer", {"degree": chosen.degree}, text
     name, light = next(iter(lights.items()))
     exposure = export_baked(scene, path, light)

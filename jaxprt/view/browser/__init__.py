@@ -4,7 +4,7 @@ import functools
 import pathlib
 import re
 
-_FOLDER = pathlib.Path(__file__).parent
+FOLDER = pathlib.Path(__file__).parent
 # Each file imports from files before it.
 _FILES = (
     "common",
@@ -40,5 +40,5 @@ def module() -> str:
 
     Imports between the files are dropped: their names are those of one scope.
     """
-    texts = [(_FOLDER / f"{name}.js").read_text("utf-8") for name in _FILES]
+    texts = [(FOLDER / f"{name}.js").read_text("utf-8") for name in _FILES]
     return "\n".join(re.sub(r"^import [^;]*;\n", "", text, flags=re.MULTILINE) for text in texts)
