@@ -39,10 +39,9 @@ EDGE, SAMPLES, PER_PIXEL = 256, 256, 4
 GROUND = 10_000  # vertices
 FRAMES = 5
 GOLD = 0.8, 0.6, 0.4
-MATTE = {"metallic": 0.0, "specular": 0.0}
 FIGURES = {
     "gold": TexturedMaterial(base_color=GOLD, metallic=1.0, roughness=0.3),
-    "matte": TexturedMaterial(base_color=GOLD, **MATTE),
+    "matte": TexturedMaterial(base_color=GOLD, metallic=0.0, specular=0.0),
 }
 FILES = {"cake": "foreign/cakeBirthday.glb", "truck": "scenes/CesiumMilkTruck.glb"}
 STUDIO, COURTYARD = "polyhaven_studio_1k.exr", "polyhaven_courtyard_1k.exr"
@@ -105,7 +104,8 @@ def standing(name: str, parts: Sequence[Part], light: pathlib.Path, edge: int, v
     position = np.concatenate([np.asarray(part.mesh.position) + np.asarray(part.mesh.origin) for part in parts])
     face = np.concatenate([np.asarray(part.mesh.face) + first for part, first in zip(parts, counts, strict=False)])
     mesh = make_mesh(position, face)
-    ground = Part("ground", ground_plane(mesh, vertices=vertices), TexturedMaterial(base_color=[0.5] * 3, **MATTE))
+    matte = TexturedMaterial(base_color=(0.5, 0.5, 0.5), metallic=0.0, specular=0.0)
+    ground = Part("ground", ground_plane(mesh, vertices=vertices), matte)
     return Case(name, Scene([*parts, ground]), light, orbit(mesh, azimuth=0.35, elevation=0.3, width=edge, height=edge))
 
 
@@ -136,11 +136,11 @@ def measure(
             **{**errors, "noise": direct.noise, "bytes": held, "vertices": relit.vertices},
         }
 
+    for renderer, file, drawn, seconds in browsers(files, case, store):
+        yield line(renderer, drawn, seconds, file.stat().st_size)
     start = time.perf_counter()
     drawn = np.asarray(relit.picture(light, case.camera, background=None))
     yield line("jaxprt", drawn, time.perf_counter() - start, prt.memory(relit))
-    for renderer, file, drawn, seconds in browsers(files, case, store):
-        yield line(renderer, drawn, seconds, file.stat().st_size)
 
 
 def truths(path: pathlib.Path, case: Case, samples: int, known: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
@@ -169,7 +169,6 @@ def browsers(
     runs += [
         (name, f"{name}.html", files["plain"], {}) for name, folder in PEERS.items() if (modules / folder).is_dir()
     ]
-
     light = store / f"{case.light.stem}.hdr"
     import OpenImageIO
 
@@ -206,7 +205,7 @@ def served(folders: dict[str, pathlib.Path]) -> Iterator[str]:
             first, _, rest = path.lstrip("/").partition("?")[0].partition("/")
             return str(folders[first] / rest if first in folders else folders[""] / first)
 
-        def log_message(self, *_: Any) -> None:
+        def log_message(self, format: str, *args: Any) -> None:
             pass
 
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Handler))

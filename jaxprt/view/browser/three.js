@@ -15,7 +15,7 @@ const SLOTS = 16; // attributes of a vertex that every implementation of WebGL 2
 const HEIGHT = 128; // rows of the environment of a light that is given by coefficients
 const MOST = 65504; // of half floats
 const SEEN = 16; // harmonics of transfer that highlights read
-const [BLUR, MIDDLE] = [0.45, 0.4]; // of the visibility that they give: width in radians, and value at an edge
+const [BLUR, MIDDLE] = [0.35, 0.4]; // of the visibility that they give: width in radians, and value at an edge
 // three.js has +x in the middle of a latitude-longitude picture, jaxprt +z.
 const QUARTER = -Math.PI / 2;
 
@@ -130,7 +130,7 @@ iblIrradiance = prtIrradiance;
   d = (vec4(d, 0.) * viewMatrix).xyz;
   float share = PI * (${seen.join(" + ")}) / max(${COSINE.slice(0, Math.sqrt(terms)).join(" + ")}, 0.06);
   float width = max(2. * pow4(material.roughness), EPSILON); // variance of the lobe along an axis
-  radiance *= clamp((share - ${MIDDLE}) * sqrt(1. + ${BLUR ** 2} / width) + ${MIDDLE}, 0., 1.);
+  radiance *= clamp((share - ${MIDDLE}) * sqrt(1. + ${(BLUR ** 2).toFixed(4)} / width) + ${MIDDLE}, 0., 1.);
 }`;
 };
 
