@@ -44,7 +44,7 @@ MISPLACED = f"""() => {{
   }}
   return bad;
 }}"""
-UNNAMED = f"""() => [...{ROOT}.querySelectorAll("button, select, input:not([hidden]), canvas")]
+UNNAMED = f"""() => [...{ROOT}.querySelectorAll("button, select, input:not([hidden]), canvas:not([aria-hidden])")]
   .filter((each) => !(each.getAttribute("aria-label") || each.labels?.[0]?.textContent || each.textContent))
   .map((each) => each.outerHTML)"""
 FOCUSED = f"""() => {{
@@ -406,7 +406,7 @@ def test_the_scene_is_shown_small_in_each_light_and_a_click_takes_it(hand, syste
         assert button.get_attribute("aria-pressed") == str(number == 0).lower()
     read = f"""[...{ROOT}.querySelectorAll(".gallery canvas")].map((canvas) =>
         Array.from(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data))"""
-    hand.page.wait_for_function(f"() => {read}.every((pixel) => pixel[3])")
+    hand.page.wait_for_function(f"() => {read}.every((pixel) => pixel.some(Boolean))")
     small = hand.page.evaluate(f"() => {read}")
     camera = hand.camera()
     eye = Camera(camera["eye"], camera["target"], [0.0, 1.0, 0.0], camera["angle"], 72, 54)

@@ -94,7 +94,8 @@ export function panelOf(viewer) {
     const number = gallery.children.length;
     const name = scene.lights[number];
     const act = { onclick: () => set({ light: number }), ariaLabel: `light: ${name}` };
-    element("canvas", element("button", gallery, { type: "button", title: name, ...act }), SMALL);
+    const button = element("button", gallery, { type: "button", title: name, ...act });
+    element("canvas", button, { ...SMALL, ariaHidden: "true" });
   };
   const sides = { low: -180, high: 180, step: 1, digits: 1, wrap: (x) => ((((x + 180) % 360) + 360) % 360) - 180 };
   const turn = slider(lightPart, "rotation °", sides, (degrees) => set({ turn: degrees * DEGREE }));
