@@ -269,20 +269,21 @@ def pages(browser: Any, folder: pathlib.Path | None) -> Iterator[dict[str, Any]]
     """What a browser draws of exported pages. Pictures are written into a folder: the browser's, ours, Mitsuba's."""
     for name, light_name in _PAGES.items():
         path = harness.data() / "env" / accuracy.LIGHTS[light_name]
-        subject = _subject(name)
+        scene, surfaces = _subject(name)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of negative pixels of lights
             light = prt.load_environment(path)
-            relit = prt.precompute(subject.scene, system="lobe", progress=False).centered()
+            made = prt.precompute(scene, system="lobe", progress=False)
+            relit = made.centered()
             with tempfile.TemporaryDirectory() as temporary:
                 piece = view.export(relit, f"{temporary}/page.html", environments={light_name: light})
                 drawn, seconds = _drawn(browser, piece.path)
         height, width = drawn.shape[:2]
         camera = dataclasses.replace(relit.camera, width=width, height=height)
         picture = np.asarray(relit.picture(light, camera, background=None))[..., :3]
-        camera = dataclasses.replace(subject.camera, width=width, height=height)
+        camera = dataclasses.replace(made.camera, width=width, height=height)
         request = {"camera": camera, "samples": accuracy.SAMPLES, "model": "gltf", "bounces": 0}
-        total, blocks, sides = assets.rendered(subject.surfaces, path, request, picture, None)
+        total, blocks, sides = assets.rendered(surfaces, path, request, picture, None)
         halves = np.where(sides[1][..., None], 0, total / blocks)
         truth = denoised.Truth(halves, 2 * blocks * accuracy.SAMPLES)
         inside = truth.inside & (drawn[..., 3] > 0.999)
@@ -302,15 +303,14 @@ def pages(browser: Any, folder: pathlib.Path | None) -> Iterator[dict[str, Any]]
         }
 
 
-def _subject(name: str) -> accuracy.Subject:
-    """A mesh and a material of the table of errors, or a file, with its camera."""
-    if ", " in name:
-        subject = accuracy.subject_of(*name.split(", "), edge=_EDGE)
-        scene = dataclasses.replace(subject.scene, cameras=[subject.camera])
-        return subject._replace(scene=scene)
-    path = harness.data() / "foreign" / name
-    scene = prt.load_scene(path)
-    return accuracy.Subject(scene, asset_files.read(path), scene.camera)
+def _subject(name: str) -> tuple[prt.Scene, Sequence[asset_files.Surface]]:
+    """A mesh and a material of the table of errors, or a file, for jaxprt and for the judge."""
+    if ", " not in name:
+        path = harness.data() / "foreign" / name
+        return prt.load_scene(path), asset_files.read(path)
+    mesh, material = name.split(", ")
+    subject = accuracy.subject_of(mesh, material, _EDGE)
+    return dataclasses.replace(subject.scene, cameras=[subject.camera]), subject.surfaces
 
 
 def _drawn(browser: Any, path: pathlib.Path) -> tuple[np.ndarray, float]:
