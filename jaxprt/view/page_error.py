@@ -14,6 +14,7 @@ from jaxprt.relit.casting import caster
 from jaxprt.relit.groups import faces_of
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Camera, Environment, sides
+from jaxprt.scene.environment import resized
 from jaxprt.view import stages
 from jaxprt.view.reduced import PageScene
 
@@ -99,7 +100,8 @@ class _Views(NamedTuple):
         return cls(cameras, pixels, np.concatenate(parts))
 
     def pictures(self, scene: RelitScene, light: Environment, shadows: str) -> Float[np.ndarray, "n 3"]:
-        """Radiance at the pixels that show surfaces."""
+        """Radiance at the pixels that show surfaces; pages may read the light in fewer texels."""
+        light = resized(light, size=scene.light_size or light.radiance.shape[-2])
         rows = []
         for camera, pixel in zip(self.cameras, self.pixel, strict=True):
             picture = np.asarray(scene.picture(light, camera, samples=1, shadows=shadows), np.float64)

@@ -17,6 +17,7 @@ from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, Part, PointLight, Scene, Texture, TexturedMaterial, builtin
 from jaxprt.scene.environment import rotate
 from jaxprt.sphere import cubemap, harmonics
+from jaxprt.systems.lobe import exported
 from jaxprt.view import messages, stages
 from jaxprt.view.content import scene_content
 from jaxprt.view.reduced import PageScene
@@ -228,6 +229,16 @@ def test_size_that_is_asked_for_is_kept_and_bounces_that_are_none_cause_no_error
     most = whole.nbytes - 2000
     smaller = view.export(bare, tmp_path / "b.html", environments={"lamp": lights["lamp"]}, most=most)
     assert (whole.edge, smaller.edge) == (2, 1)
+
+
+def test_page_whose_lobes_read_fewer_texels_than_the_light_has_is_measured(systems, lights, tmp_path, monkeypatch):
+    scene = systems["lobes"].without_bounces()
+    lobes = [put(scene.part_system(number)).system for number in range(2)]
+    bare = RelitScene(scene.scene, scene.shading, Layout.apart(scene.layout.counts), lobes)
+    whole = view.export(bare, tmp_path / "a.html", environments={"lamp": lights["lamp"]})
+    monkeypatch.setattr(exported, "_LIGHT", 4)
+    coarse = view.export(bare, tmp_path / "b.html", environments={"lamp": lights["lamp"]})
+    assert whole.error < coarse.error < 2 * whole.error
 
 
 def test_page_asks_for_nothing(made):
