@@ -1,4 +1,7 @@
-"""Makes pictures/viewer.webp: plays the viewer in headless Chromium, `python docs/make_viewer.py`.
+"""Makes pictures of the viewer in headless Chromium: `python -m docs.make_viewer` plays it for pictures/viewer.webp.
+
+`JAXPRT_DATA=FOLDER python -m docs.make_viewer stills` makes those at rest of docs/guides/viewer.md, on screens of
+three sizes, with the bust of docs/make_gallery.py.
 
 Each frame is shown for a fixed share of what the viewer took for it, from the gesture to the picture, on the machine
 that ran it. `SPEED` says how much faster that is, and README names it beside the picture.
@@ -9,21 +12,26 @@ import io
 import math
 import pathlib
 import shutil
+import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
 import jaxprt as prt
+from docs import make_gallery
 from jaxprt.scene import builtin
 
 PICTURE = pathlib.Path(__file__).parents[1] / "pictures" / "viewer.webp"
 SIZE = (640, 400)
 SHOWN = (960, 600)  # the page, which is drawn larger and then reduced
 MOST_BYTES = 2_500_000
+STILLS = {"laptop": (1100, 700), "large": (3840, 2000), "phone": (390, 844)}  # pages
+WIDEST = 1280  # pixels of a still in its file
 SPEED = 6  # frames are shown so many times as fast as they were made
 LEAST, RESTING = 40, 1200  # milliseconds that a frame is shown at least, and that a picture at rest is
 QUALITY = 82  # of the frames, which keep their own colors
@@ -136,21 +144,46 @@ def write(frames: list[Image.Image], milliseconds: list[float]) -> int:
     return PICTURE.stat().st_size
 
 
+@contextmanager
+def viewer(
+    scene: prt.RelitScene, size: tuple[int, int], environments: Mapping[str, prt.Environment] | None = None
+) -> Iterator[Page]:
+    """A page of some size that shows a scene in the viewer."""
+    with sync_playwright() as playwright:
+        server = prt.view.serve(scene, environments=environments)
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=_SWITCHES)
+        page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+        page.set_default_timeout(600_000)
+        page.goto(server.url)
+        yield page
+        browser.close()
+        server.close()
+
+
+def stills() -> None:
+    """Writes what the viewer shows at rest on screens of three sizes."""
+    shot, scene = make_gallery.small_bust()
+    for name, size in STILLS.items():
+        with viewer(scene, size, {"studio": shot.light}) as page:
+            film = Film(page)
+            film.settle()
+            page.locator("select", has=page.locator("option", has_text="agx")).select_option(label="agx")
+            film.rest()
+            image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+        image.thumbnail((WIDEST, WIDEST), Image.Resampling.LANCZOS)
+        path = make_gallery.FOLDER / f"viewer_{name}.jpg"
+        image.save(path, quality=QUALITY)
+        print(path, f"{path.stat().st_size:,} bytes", flush=True)
+
+
 def main() -> None:
     """Makes the picture.
 
     Raises:
         ValueError: It is too large.
     """
-    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
-        server = prt.view.serve(relit(f"{folder}/scene.prt"))
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=_SWITCHES)
-        page = browser.new_page(viewport={"width": SHOWN[0], "height": SHOWN[1]})
-        page.set_default_timeout(120_000)
-        page.goto(server.url)
+    with tempfile.TemporaryDirectory() as folder, viewer(relit(f"{folder}/scene.prt"), SHOWN) as page:
         film = play(page)
-        browser.close()
-        server.close()
     count = write(film.frames, film.milliseconds)
     moving = sorted(each for each in film.milliseconds if each != RESTING)
     middle = SPEED * moving[len(moving) // 2]
@@ -160,4 +193,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    stills() if sys.argv[1:] == ["stills"] else main()
