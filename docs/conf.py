@@ -55,6 +55,7 @@ html_title = "jaxprt"
 html_copy_source = False
 html_static_path = ["_static"]
 html_css_files = ["mathml.css"]
+html_extra_path = ["live.html", "beside.html"]  # of the gallery
 html_theme_options = {
     "use_download_button": False,
     "use_fullscreen_button": False,

@@ -28,7 +28,7 @@ from jaxprt.relit.exact import exact_picture
 from jaxprt.scene import TexturedMaterial
 from jaxprt.scene.environment import finer, resized, rotate
 from jaxprt.scene.material import Texture
-from jaxprt.scene.mesh import bounds, brush, ground_plane, join, make_mesh, split
+from jaxprt.scene.mesh import bounds, ground_plane, join, make_mesh, split
 from jaxprt.scene.occluder import simplify
 from jaxprt.view.stages import about
 
@@ -215,8 +215,8 @@ def planks(texels: int = 512) -> Texture:
 
 
 def leather() -> Shot:
-    """A machine part of brushed steel on a pad of leather."""
-    arm = brush(prt.load_mesh(DATA / "meshes" / "rocker_arm.ply"), [0.0, 1.0, 0.0])
+    """A machine part of steel on a pad of leather."""
+    arm = prt.load_mesh(DATA / "meshes" / "rocker_arm.ply")
     low, high = bounds(arm)
     size, middle, extent = float(max(high - low)), (low + high) / 2, high - low
     thickness, half = 0.16 * size, (1.05 * extent[0] / 2 + 0.12 * size, extent[2] / 2 + 0.2 * size)
@@ -228,11 +228,11 @@ def leather() -> Shot:
     along = np.tile([1.0, 0, 0], (len(position), 1))
     pad = make_mesh(position, face, normal=normal, texture=place, tangent=along)
     parts = [
-        prt.Part("arm", arm, metal((0.86, 0.84, 0.81), 0.3, anisotropy=0.6)),
+        prt.Part("arm", arm, metal((0.86, 0.84, 0.81), 0.34)),
         prt.Part("leather", pad, plastic((0.055, 0.022, 0.012), 0.4, normal_texture=grain())),
         prt.Part("backdrop", backdrop(pad, edge=90), matte((0.3, 0.28, 0.26))),
     ]
-    camera = prt.scene.camera.orbit(arm, azimuth=0.6, elevation=0.42, width=LARGE, height=LARGE)
+    camera = prt.scene.camera.orbit(arm, azimuth=0.42, elevation=0.4, width=LARGE, height=LARGE)
     return Shot(prt.Scene(parts), camera, light("polyhaven_studio_1k.exr", turn=0.4), stops=0.3)
 
 
@@ -321,9 +321,24 @@ def lights() -> None:
     names = ("polyhaven_studio_1k.exr", "polyhaven_courtyard_1k.exr", "polyhaven_sunrise_1k.exr")
     names += ("grace_cross.hdr", "stpeters_cross.hdr", "eucalyptus_rnl_cross.hdr")
     files = [DATA / "meshes" / "max_planck_decimated.ply", *(DATA / "env" / name for name in names)]
-    material = "metallic-roughness:base_color=.72/.43/.2,metallic=1,roughness=.3"
+    material = "metallic-roughness:base_color=.72/.43/.2,metallic=1,roughness=.4"
     path = KEPT / "lights.png"
-    options = ["--brdf", material, "--tone", "agx", "--size", str(EDGE), "--columns", "3", "--output", path]
+    options = [
+        "--brdf",
+        material,
+        "--tone",
+        "agx",
+        "--azimuth",
+        "200",
+        "--turn",
+        "180",
+        "--size",
+        str(EDGE),
+        "--columns",
+        "3",
+        "--output",
+        path,
+    ]
     subprocess.run([sys.executable, "-m", "jaxprt", "lights", *files, *options], check=True)
     write("lights", Image.open(path).convert("RGB"))
 
