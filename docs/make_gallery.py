@@ -233,7 +233,7 @@ def leather() -> Shot:
         prt.Part("backdrop", backdrop(pad, edge=90), matte((0.3, 0.28, 0.26))),
     ]
     camera = prt.scene.camera.orbit(arm, azimuth=0.42, elevation=0.4, width=LARGE, height=LARGE)
-    return Shot(prt.Scene(parts), camera, light("polyhaven_studio_1k.exr", turn=0.4), stops=0.3)
+    return Shot(prt.Scene(parts), camera, light("polyhaven_studio_1k.exr", turn=0.4), stops=-0.9)
 
 
 def room() -> Shot:
