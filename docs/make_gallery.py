@@ -250,7 +250,9 @@ def room() -> Shot:
     meshes = [boards, *others]
     parts = [prt.Part(*part) for part in zip(names, meshes, materials, strict=True)]
     camera = prt.Camera([1.15, 1.25, 2.9], [-0.25, 0.75, -1.0], [0, 1, 0], 0.95, LARGE, LARGE)
-    return Shot(prt.Scene(parts), camera, prt.scene.builtin.daylight(), bounces=2)
+    return Shot(
+        prt.Scene(parts), camera, rotate(prt.scene.builtin.daylight(), about(1.75 * np.pi)), bounces=2, stops=0.4
+    )
 
 
 def cake() -> Shot:
