@@ -210,7 +210,7 @@ def planks(texels: int = 512) -> Texture:
     for _ in range(24):
         fiber = (fiber + np.roll(fiber, 1, 0) + np.roll(fiber, -1, 0)) / 3
     joint = (np.abs(board % 1 - 0.5) > 0.485) | (np.abs(along % 1 - 0.5) > 0.496)
-    value = np.where(joint, 0.35, 1) * tone * (1 + 0.07 * fiber / fiber.std())
+    value = np.where(joint, 0.35, 1) * np.clip(tone * (1 + 0.07 * fiber / fiber.std()), 0.2, 1.25)
     return Texture(np.clip(value[..., None] / 1.25 * [1.0, 0.92, 0.82], 0, 1))
 
 
@@ -241,7 +241,15 @@ def room() -> Shot:
     names = ("floor", "sofa", "window wall", "back wall", "right wall", "ceiling")
     names += ("rug", "table", "lamp", "vase", "picture", "cushions")
     wall, wood = matte((0.8, 0.77, 0.71)), plastic((0.62, 0.4, 0.23), 0.42, base_color_texture=planks())
-    materials = [wood, plastic((0.035, 0.12, 0.12), 0.6), wall, wall, wall, matte(0.84), matte((0.62, 0.55, 0.45))]
+    materials = [
+        wood,
+        plastic((0.035, 0.12, 0.12), 0.6),
+        wall,
+        wall,
+        wall,
+        matte((0.85, 0.85, 0.83)),
+        matte((0.62, 0.55, 0.45)),
+    ]
     materials += [plastic((0.3, 0.16, 0.08), 0.35), matte((0.85, 0.8, 0.65)), plastic((0.75, 0.3, 0.12), 0.3)]
     materials += [matte((0.2, 0.28, 0.33)), matte((0.8, 0.5, 0.1))]
     floor, *others = split(interiors.room())
