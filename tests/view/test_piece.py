@@ -15,7 +15,7 @@ from jaxprt.compile import put
 from jaxprt.relit.groups import Layout
 from jaxprt.relit.scene import RelitScene
 from jaxprt.scene import Environment, Part, PointLight, Scene, Texture, TexturedMaterial, builtin
-from jaxprt.scene.environment import rotate
+from jaxprt.scene.environment import resized, rotate
 from jaxprt.sphere import cubemap, harmonics
 from jaxprt.systems.lobe import exported
 from jaxprt.view import messages, stages
@@ -232,12 +232,11 @@ def test_size_that_is_asked_for_is_kept_and_bounces_that_are_none_cause_no_error
 
 
 def test_page_whose_lobes_read_fewer_texels_than_the_light_has_is_measured(systems, lights, tmp_path, monkeypatch):
-    scene = systems["lobes"].without_bounces()
-    lobes = [put(scene.part_system(number)).system for number in range(2)]
-    bare = RelitScene(scene.scene, scene.shading, Layout.apart(scene.layout.counts), lobes)
-    whole = view.export(bare, tmp_path / "a.html", environments={"lamp": lights["lamp"]})
-    monkeypatch.setattr(exported, "_LIGHT", 4)
-    coarse = view.export(bare, tmp_path / "b.html", environments={"lamp": lights["lamp"]})
+    recipe, light = prt.relit.Lobes(8, texels=0), {"lamp": resized(lights["lamp"], size=16)}
+    bare = prt.precompute(systems["lobes"].scene, refine=False, system=recipe, size=16, progress=False)
+    whole = view.export(bare, tmp_path / "a.html", environments=light)
+    monkeypatch.setattr(exported, "_LIGHT", 8)
+    coarse = view.export(bare, tmp_path / "b.html", environments=light)
     assert whole.error < coarse.error < 2 * whole.error
 
 
