@@ -58,6 +58,12 @@ class Hand:
             drawn = now
             time.sleep(0.5)
 
+    def pictured(self):
+        """Until the panel shows the scene small in each light."""
+        read = "canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data.some(Boolean)"
+        every = f"[...{CANVAS}.getRootNode().querySelectorAll('.gallery canvas')].every((canvas) => {read})"
+        self.page.wait_for_function(f"() => {every}")
+
     def drag(self, start, end, steps=5, button="left"):
         self.page.mouse.move(*start)
         self.page.mouse.down(button=button)

@@ -404,10 +404,11 @@ def test_the_scene_is_shown_small_in_each_light_and_a_click_takes_it(hand, syste
     for number, button in enumerate(buttons):
         button.wait_for()
         assert button.get_attribute("aria-pressed") == str(number == 0).lower()
-    read = f"""[...{ROOT}.querySelectorAll(".gallery canvas")].map((canvas) =>
-        Array.from(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data))"""
-    hand.page.wait_for_function(f"() => {read}.every((pixel) => pixel.some(Boolean))")
-    small = hand.page.evaluate(f"() => {read}")
+    hand.pictured()
+    small = hand.page.evaluate(
+        f"""() => [...{ROOT}.querySelectorAll(".gallery canvas")].map((canvas) =>
+            Array.from(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data))"""
+    )
     camera = hand.camera()
     eye = Camera(camera["eye"], camera["target"], [0.0, 1.0, 0.0], camera["angle"], 72, 54)
     cover = np.asarray(systems["lobes"].coverage(eye)) == 1

@@ -350,8 +350,7 @@ def test_light_view_and_material_change_without_python(browser, systems, lights)
     bare = systems["lobes"].without_bounces()
     server = Server(session := Counted(bare, environments=lights))
     hand = by_gpu(browser, server.url)
-    for name in lights:  # small pictures of both lights, which Python makes once
-        hand.page.get_by_role("button", name=f"light: {name}").wait_for()
+    hand.pictured()  # by Python, once
     before = session.asked["look"]
     hand.drag((100, 100), (160, 130))
     hand.page.keyboard.press("l")
