@@ -9,6 +9,8 @@ from PIL import Image
 
 CANVAS = "document.querySelector('#viewer').shadowRoot.querySelector('.canvas')"
 TOLD = "document.querySelector('#viewer').shadowRoot.querySelector('.told').textContent"
+SMALL = f"""[...{CANVAS}.getRootNode().querySelectorAll('.gallery canvas')].map((canvas) =>
+  Array.from(canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data))"""
 WIDTH = 584  # 320 for the picture, and the panel
 
 
@@ -60,9 +62,11 @@ class Hand:
 
     def pictured(self):
         """Until the panel shows the scene small in each light."""
-        read = "canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data.some(Boolean)"
-        every = f"[...{CANVAS}.getRootNode().querySelectorAll('.gallery canvas')].every((canvas) => {read})"
-        self.page.wait_for_function(f"() => {every}")
+        self.page.wait_for_function(f"() => {SMALL}.every((pixel) => pixel.some(Boolean))")
+
+    def small(self):
+        """These pictures, rows of RGBA in bytes."""
+        return [np.reshape(pixel, (54, 72, 4)) for pixel in self.page.evaluate(f"() => {SMALL}")]
 
     def drag(self, start, end, steps=5, button="left"):
         self.page.mouse.move(*start)

@@ -9,18 +9,19 @@ import numpy as np
 import pytest
 
 import jaxprt as prt
-from jaxprt import view
+from jaxprt import image, view
 from jaxprt.brdf import BlinnPhong
 from jaxprt.compile import put
 from jaxprt.relit.groups import Layout
 from jaxprt.relit.scene import RelitScene
-from jaxprt.scene import Environment, Part, PointLight, Scene, Texture, TexturedMaterial, builtin
+from jaxprt.scene import Camera, Environment, Part, PointLight, Scene, Texture, TexturedMaterial, builtin
 from jaxprt.scene.environment import resized, rotate
 from jaxprt.sphere import cubemap, harmonics
 from jaxprt.systems.lobe import exported
 from jaxprt.view import messages, stages
 from jaxprt.view.content import scene_content
 from jaxprt.view.reduced import PageScene
+from tests.view.hand import CANVAS, Hand
 
 pytestmark = pytest.mark.filterwarnings("ignore:the page has light of bounces in part")
 
@@ -304,6 +305,28 @@ def test_viewer_of_the_page_draws_and_follows_hands(browser, made):
     )
     assert not told
     tab.close()
+
+
+def test_the_page_shows_its_scene_small_in_each_light(browser, made, systems, lights):
+    hand = Hand(browser, made.path.as_uri())
+    hand.pictured()
+    hand.page.wait_for_function(f"() => ({CANVAS}).pixels().stats.samples === 9")
+    scene, camera = PageScene.of(systems["lobes"]).reduced(2, texels=True).relit(), hand.camera()
+    eye = Camera(camera["eye"], camera["target"], [0.0, 1.0, 0.0], camera["angle"], 72, 54)
+    cover = np.asarray(scene.coverage(eye)) == 1
+    for pixel, light in zip(hand.small(), lights.values(), strict=True):
+        picture = scene.picture(light, eye, shadows="vertices")
+        shown = np.asarray(image.display(picture, stops=scene.exposure(picture, eye)))
+        assert np.abs(pixel[..., :3] / 255 - shown)[cover].mean() < 0.02
+    before = hand.pixels()  # in the light of the moment
+    hand.page.keyboard.press("l")
+    hand.finish()
+    assert np.abs(hand.pixels() - before).max() > 0.05
+    hand.page.get_by_role("button", name=f"light: {next(iter(lights))}").click()
+    hand.finish()
+    assert np.abs(hand.pixels() - before).mean() < 0.005
+    hand.page.close()
+    assert not hand.errors
 
 
 def test_parts_with_one_kind_of_material_share_a_table():

@@ -349,16 +349,24 @@ export class Drawing {
     for (const each of buffers) gl.deleteRenderbuffer(each);
     return result;
   }
-  // A small picture by other colors of the vertices in half floats, at an exposure of its own.
-  thumbnail(camera, state, center, size, [data, scale]) {
+  // A small picture in another light, at an exposure of its own: by colors of the vertices in half floats, or by those
+  // that the GPU makes for a message.
+  thumbnail(camera, state, center, size, { message = null, color = null, scale = 1 }) {
     const { gpu, given } = this;
-    this.gpu = null;
-    this.setColor(data, false, scale);
+    const { message: now, shown } = gpu ?? {};
+    if (message) Object.assign(gpu, { message, shown: null });
+    else {
+      this.gpu = null;
+      this.setColor(color, false, scale);
+    }
     const stops = this.exposure(camera, state, center) ?? 0;
     const pixel = this.pixels(camera, { ...state, stops, background: "none" }, center, size);
-    this.gpu = gpu;
-    if (given) this.setColor(...given);
-    else this.drawn = false;
+    if (message) Object.assign(gpu, { message: now, shown });
+    else {
+      this.gpu = gpu;
+      if (given) this.setColor(...given);
+      else this.drawn = false;
+    }
     return pixel;
   }
   // Stops at which the brightest surfaces that are seen come near white, as `jaxprt.image.automatic_exposure` has them:

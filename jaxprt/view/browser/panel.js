@@ -183,7 +183,7 @@ export function panelOf(viewer) {
     show() {
       if (light.length !== scene.lights.length) light.fill(scene.lights);
       light.value = state.light;
-      while (scene.rests.length && gallery.children.length < scene.lights.length) pictured();
+      while (scene.pictured && gallery.children.length < scene.lights.length) pictured();
       gallery.hidden = gallery.children.length < 2;
       [...gallery.children].forEach((button, i) => (button.ariaPressed = String(i === state.light)));
       turn.show(sides.wrap(state.turn / DEGREE));

@@ -1,6 +1,6 @@
 // What comes while nothing moves: the light as it is seen, pictures at pixels, and small pictures of the other lights.
 
-import { decompressed, inflate, numbers } from "./common.js";
+import { decompressed, inflate, numbers, pause } from "./common.js";
 import { SMALL } from "./panel.js";
 
 const PATIENT = 250; // milliseconds without a change after which a rest begins
@@ -58,22 +58,25 @@ export class Rests {
       this.forgetSky();
     }
   }
-  // Small pictures of the scene in each light.
+  // Small pictures of the scene in each light: by colors from Python, or by the GPU where there is none.
   async thumbnails() {
     const { viewer, small } = this;
-    const { scene, stats } = viewer;
+    const { drawing, scene, stats } = viewer;
     const { seq } = stats;
     const plain = { turn: 0, lamps: [], stops: null, vertices: "all" };
-    if (scene.lights.length < 2 || !scene.rests.length) return;
+    if (scene.lights.length < 2 || !scene.pictured) return;
     for (let light = small.size; light < scene.lights.length && seq === stats.seq && !viewer.closed; light++) {
+      const message = { ...viewer.message("look"), ...plain, light };
+      const alone = !scene.rests.length;
+      if (alone && !drawing.gpu) return;
       try {
-        const { content, buffers } = await viewer.ask({ ...viewer.message("look"), ...plain, light });
+        const { content, buffers } = alone ? { content: { kind: "color" }, buffers: [] } : await viewer.ask(message);
         if (viewer.closed || content.kind !== "color" || small.has(light)) return;
-        const color = numbers(Uint16Array, buffers[0]);
-        const { camera, state } = viewer;
-        small.set(light, viewer.drawing.thumbnail(camera, state, scene.center, SMALL, [color, content.scale]));
+        const colors = alone ? { message } : { color: numbers(Uint16Array, buffers[0]), scale: content.scale };
+        small.set(light, drawing.thumbnail(viewer.camera, viewer.state, scene.center, SMALL, colors));
         viewer.controls?.thumbnail(light, small.get(light));
         viewer.redraw();
+        if (alone) await pause();
       } catch {
         return;
       }

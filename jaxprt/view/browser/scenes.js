@@ -11,7 +11,7 @@ const FIRST = 50; // before there is a scene
  * @typedef {{ version: number, scene: number, finished: boolean, vertices: number, note?: string, parts: Part[],
  *   backs?: number, center: number[], origin: number[], radius: number, eye: number[], target: number[],
  *   field_of_view: number, lights: string[], systems: Record<string, { bounces: boolean }>, rests: string[],
- *   buffers: DataView<ArrayBuffer>[], position: Float32Array, face: Uint32Array }} Scene
+ *   pictured?: boolean, buffers: DataView<ArrayBuffer>[], position: Float32Array, face: Uint32Array }} Scene
  */
 
 export class Scenes {
@@ -116,7 +116,8 @@ export class Scenes {
     if (this.bouncing) state.bounces = false;
     const another = viewer.scene && loaded.scene !== viewer.scene.scene;
     const first = !viewer.camera;
-    viewer.scene = Object.assign(viewer.scene ?? {}, loaded);
+    const pictured = loaded.rests.length > 0 || loaded.finished; // whether it is shown small in each light
+    viewer.scene = Object.assign(viewer.scene ?? {}, loaded, { pictured });
     [viewer.colors.bytes, viewer.exposed] = [null, null]; // an automatic exposure is found for each better scene
     if (another) {
       [viewer.camera, state.materials, viewer.picking.opened] = [null, {}, ""];
