@@ -135,6 +135,7 @@ export class Rests {
     viewer.redraw();
     stats[coarse ? "coarse" : "stills"]++;
     if (coarse) return true;
+    if (viewer.drawing.gpu) viewer.describe(`${kind === "still" ? "picture at pixels" : "exact picture"} by Python`);
     if (kind === "still") this.whole = { ...whole, made: whole.made + 1, ms: content.ms };
     else {
       const percent = (share) => (100 * share).toFixed(1);
