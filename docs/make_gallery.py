@@ -9,6 +9,7 @@ import base64
 import io
 import os
 import pathlib
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -40,42 +41,6 @@ EDGE = 384
 LARGE = 1024  # pixels along an edge of a large picture
 UPRIGHT = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # of a mesh whose third axis points up
 MOST_BYTES = 2_000_000  # of the live page
-
-# The divider is where the slider is; the slider lies over the pictures.
-BESIDE = """<!doctype html>
-<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>jaxprt beside Mitsuba</title><link rel="icon" href="data:,">
-<style>
-body {{ margin: 0; background: #16161a; color: #ddd; font: 16px/1.5 system-ui, sans-serif; }}
-figure {{ position: relative; width: min(100vw, max(320px, 100vh - 9rem)); margin: auto; aspect-ratio: 1;
-  overflow: hidden; --at: 50%; }}
-img, input {{ position: absolute; inset: 0; width: 100%; height: 100%; margin: 0; }}
-img + img {{ clip-path: inset(0 calc(100% - var(--at)) 0 0); }}
-input {{ opacity: 0; cursor: ew-resize; touch-action: pan-y; }}
-i, b {{ pointer-events: none; }}
-i {{ position: absolute; top: 0; bottom: 0; left: calc(var(--at) - 1px); width: 2px; background: #fff; }}
-i::after {{ content: "\\2194"; position: absolute; top: 50%; left: -21px; width: 44px; border-radius: 50%;
-  color: #16161a; background: #fff; font-size: 24px; line-height: 44px; text-align: center; }}
-input:focus-visible + i {{ outline: 3px solid #6af; }}
-b {{ position: absolute; top: .6rem; padding: 0 .5rem; border-radius: .3rem; background: #16161acc; }}
-p {{ max-width: 62rem; margin: .8rem auto; padding: 0 1rem; }}
-code {{ color: #fff; }}
-</style>
-<figure>
-<img alt="The bust by Mitsuba" src="{mitsuba}"><img alt="The bust by jaxprt" src="{jaxprt}">
-<b style="left: .6rem">jaxprt</b><b style="right: .6rem">Mitsuba 3</b>
-<input type="range" min="0" max="100" step="0.1" value="50" aria-label="How much is by jaxprt, in percent"><i></i>
-</figure>
-<p>Drag the divider, or move it by the arrow keys. Left of it the bust is relit by jaxprt from precomputed lobes. Right
-of it Mitsuba has path traced the same triangles and materials in the pixels of the light's file, with {samples} samples
-a pixel and {noise} % noise. Both have direct light. The relative L2 error of jaxprt's linear picture is {error} %,
-without Mitsuba's noise, by <code>python -m docs.make_gallery beside</code>.</p>
-<script>
-const slider = document.querySelector("input");
-slider.oninput = () => slider.parentElement.style.setProperty("--at", slider.value + "%");
-slider.oninput();
-</script></html>
-"""
 
 
 class Shot(NamedTuple):
@@ -375,7 +340,7 @@ def live() -> None:
 
 
 def beside() -> None:
-    """A page with the bust by jaxprt over the same by Mitsuba, behind a divider, and the error."""
+    """Puts the bust by jaxprt and the same by Mitsuba into their page with a divider, and the error."""
     shot = bust()
     relit = shot.relit("bust")
     picture = relit.picture(shot.light, shot.camera)
@@ -389,9 +354,12 @@ def beside() -> None:
     stops = float(relit.exposure(picture, shot.camera))
     images = {"jaxprt": shot.shown(picture, stops), "mitsuba": shot.shown(traced, stops)}
     numbers = {"error": 100 * truth.error(np.asarray(picture)), "noise": 100 * truth.noise, "samples": truth.samples}
-    fields = {name: data_address(image) for name, image in images.items()}
-    fields |= {name: f"{value:,}" if name == "samples" else f"{value:.2g}" for name, value in numbers.items()}
-    page = BESIDE.format(**fields)
+    page = (DOCS / "beside.html").read_text()
+    for name, image in images.items():
+        page = re.sub(f'(<img id="{name}"[^>]* src=")[^"]*', rf"\g<1>{data_address(image)}", page)
+    for name, value in numbers.items():
+        text = f"{value:,}" if name == "samples" else f"{value:.2g}"
+        page = re.sub(f'(<span id="{name}">)[^<]*', rf"\g<1>{text}", page)
     (DOCS / "beside.html").write_text(page)
     print(DOCS / "beside.html", f"{len(page):,} bytes", numbers, flush=True)
 

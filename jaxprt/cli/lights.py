@@ -68,6 +68,8 @@ def command(chosen: SimpleNamespace) -> options.Result:
     options.make_folder(chosen.store)
     (system,), scene = chosen.system, two_sided(centered(options.call(inputs.scene, chosen)))
     camera = options.call(inputs.camera, chosen, parts=inputs.objects(scene, chosen))
+    for _ in _lights(chosen):  # a broken file is told before anything is traced
+        pass
     (recipe,) = options.recipes(system, chosen).values()
     progress, store = sys.stderr.isatty(), chosen.store and chosen.store / system
     wanted = {"size": chosen.light_size or inputs.LIGHT_SIZE, "bounces": chosen.bounces, "path": store}

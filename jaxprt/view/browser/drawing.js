@@ -73,7 +73,6 @@ export class Drawing {
     this.gpu = null; // shades pixels; null where colors come from Python
     this.unexposed = false; // whether the next picture is measured
     this.exposed = null; // what is called with its exposure
-    this.skyScale = this.skyHeight = 1;
     this.coarseSky = null;
     this.encoded = this.drawn = false; // whether colors are those of the display, and whether there are any
     this.scale = 1;
@@ -108,7 +107,7 @@ export class Drawing {
     this.position = gl.createBuffer();
     this.color = gl.createBuffer();
     this.index = gl.createBuffer();
-    this.skyImage = this.blurredImage = this.seen = null;
+    this.seen = this.blurredImage = null; // the picture of the light
     this.gpu?.build();
     this.stills = []; // pictures at rest: the last one appears over the one before
   }
@@ -154,8 +153,8 @@ export class Drawing {
   setSky(data, { width, height, scale, levels = 1 }, of) {
     // levels: pictures of half the size follow, as mip maps; of: the light and lamps, as `Piece` calls them
     const gl = this.gl;
-    if (this.skyImage) gl.deleteTexture(this.skyImage);
-    this.skyImage = this.texture(data, width, height, false, true);
+    if (this.seen) gl.deleteTexture(this.seen.image);
+    this.seen = { image: this.texture(data, width, height, false, true), scale, height, of };
     for (let level = 1, first = 3 * width * height; level < levels; level++) {
       const [w, h] = [width >> level, height >> level];
       const pixel = data.subarray(first, (first += 3 * w * h));
@@ -163,8 +162,6 @@ export class Drawing {
     }
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, levels - 1);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
-    [this.skyScale, this.skyHeight] = [scale, height];
-    this.seen = { image: this.skyImage, scale, height, of };
     // The last and smallest of the pictures is what is blurred.
     const [w, h] = [width >> (levels - 1), height >> (levels - 1)];
     if (this.blurredImage) gl.deleteTexture(this.blurredImage);
@@ -172,9 +169,10 @@ export class Drawing {
   }
   // The light as it is seen, its brightness, and the level of detail of its image; null where it is not the background.
   behind(camera, state, height) {
-    const lod = Math.log2((2 * Math.tan(camera.angle / 2) * this.skyHeight) / (height * Math.PI));
-    if (state.background === "light" && this.skyImage) return { image: this.skyImage, lod };
-    if (state.background !== "blurred light" || !this.skyImage) return null;
+    const { seen } = this;
+    if (!seen || !["light", "blurred light"].includes(state.background)) return null;
+    const lod = Math.log2((2 * Math.tan(camera.angle / 2) * seen.height) / (height * Math.PI));
+    if (state.background === "light") return { image: seen.image, lod };
     this.blurredImage ??= this.texture(blurred(this.coarseSky), 2 * BLURRED, BLURRED, false, true);
     return { image: this.blurredImage, lod: 0 };
   }
@@ -225,7 +223,7 @@ export class Drawing {
     if (sky) {
       const program = through ? this.through : this.sky;
       if (through) this.quad(program, image.handle, gain, false, tone);
-      else this.quad(program, sky.image, gain * this.skyScale, false, tone);
+      else this.quad(program, sky.image, gain * this.seen.scale, false, tone);
       gl.uniformMatrix3fv(program.at("ray"), false, camera.ray(width / height));
       gl.uniform1f(program.at("turn"), state.turn);
       gl.uniform1f(program.at("lod"), sky.lod);
@@ -233,7 +231,7 @@ export class Drawing {
         gl.activeTexture(gl.TEXTURE0 + gpu.stencilUnit);
         gl.bindTexture(gl.TEXTURE_2D, sky.image);
         gl.uniform1i(program.at("behind"), gpu.stencilUnit);
-        gl.uniform1f(program.at("bright"), this.skyScale);
+        gl.uniform1f(program.at("bright"), this.seen.scale);
       }
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
