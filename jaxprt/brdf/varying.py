@@ -62,4 +62,5 @@ class Channels(eqx.Module):
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b k"]:
         """Values in 1/sr, times the scales."""
-        return jnp.concatenate([model(wi, wo) for model in self.model], -1) * self.scale
+        scale = jnp.asarray(self.scale)
+        return jnp.concatenate([model(wi, wo) * scale[number] for number, model in enumerate(self.model)], -1)

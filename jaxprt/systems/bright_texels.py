@@ -487,17 +487,20 @@ def texel_radiance(
     weight = None if blend is None else jnp.moveaxis(blend.weight, 0, 2)
 
     def one(wi, wo, *parameter):
-        return brdf(*parameter)(wi, wo) if parameter else brdf(wi, wo)
+        # Channels apart: XLA on CPUs would compute an array of all with a branch for each of its values.
+        return list(brdf(*parameter)(wi, wo) if parameter else brdf(wi, wo))
 
-    value = jax.vmap(one, in_axes=(1, 1, *(0 for _ in parameter)), out_axes=1)
+    value = jax.vmap(one, in_axes=(1, 1, *(0 for _ in parameter)))
 
     def lit(argument):
         direction, area, number = argument
         share = visible[number] if carried else points.carry(visible[number])
-        reflected = point(direction, area) * share.astype(wo.dtype)
-        if weight is not None:
-            reflected = jnp.sum(reflected[:, None] * weight, 0)
-        return reflected * excess[number][:, None]
+        channel, cosine = point(direction, area)
+        if weight is None:
+            reflected = jnp.stack(channel)
+        else:
+            reflected = sum(value * factor for value, factor in zip(channel, weight, strict=True))
+        return reflected * (cosine * share.astype(wo.dtype)) * excess[number][:, None]
 
     def counts(rows):
         # No vertex of many rows sees some texels, such as those that do not stand out.
@@ -508,7 +511,7 @@ def texel_radiance(
         cosine = jnp.maximum(_component(frame[2], area), 0)
         if above is not None:
             cosine = jnp.where(_component(above.T, direction) > 0, cosine, 0)
-        return value(wi, wo, *parameter) * cosine
+        return value(wi, wo, *parameter), cosine
 
     if not len(texel):  # Rows are read by number: one that brings nothing.
         texel, spot, squares = jnp.zeros(1, jnp.int32), None, (Squares(1, 1, 1),)
