@@ -89,8 +89,8 @@ class DiffuseTracer:
         place, face = (
             np.concatenate(pair) for pair in ((other.position, position), (other.face, casting + len(other.position)))
         )
-        start, buried = start_points_and_buried(mesh, Occluder(_mesh(place, face)), offset=offset)
         rows = index[around.size :]
+        start, buried = start_points_and_buried(mesh, Occluder(_mesh(place, face)), offset=offset, wanted=rows)
         return self._light(start[rows], normal[vertex]), buried[rows]
 
     def at_points(

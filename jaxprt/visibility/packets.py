@@ -4,7 +4,9 @@ Embree calls a filter function for each hit on a surface that is not opaque. The
 ray hits and refuses hits where light passes. Opaque scenes have no filter.
 """
 
+import functools
 from functools import partial
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, Integer
@@ -34,7 +36,8 @@ _CONTEXT = np.dtype(
 _FILTER = np.dtype(  # RTCFilterFunctionNArguments
     [("valid", "i8"), ("table", "i8"), ("context", "i8"), ("ray", "i8"), ("hit", "i8"), ("count", "u4")], align=True
 )
-_NO_SHARE = np.ones(0, np.float32)
+_NO_SHARE, _NO_HIT = np.ones(0, np.float32), np.zeros(0, _HIT)
+_ENDLESS = np.full(1, embree.ENDLESS, np.float32)
 _inline = partial(numba_loop, inline="always")
 
 
@@ -77,7 +80,8 @@ class Packets(embree.Triangles):
         if opacity is not None and len(clear):
             self._table, self._arrays = _table(face[clear], layer[clear], opacity)
             vertex, corner = np.unique(face[clear], return_inverse=True)
-            options = {"hit_filter": _filter.address, "data": self._table.ctypes.data}
+            self._filter = _compiled_filter()
+            options = {"hit_filter": self._filter.address, "data": self._table.ctypes.data}
             self.attach(position[vertex], corner.reshape(-1, 3), **options)
         self.commit(f"{len(position)} vertices and {len(face)} triangles")
 
@@ -90,7 +94,7 @@ class Packets(embree.Triangles):
     ) -> Float32[np.ndarray, " n"]:
         """Share of light that passes along each ray. `Occluder.blocked` explains the arguments."""
         share = np.ones(len(point), np.float32)
-        _trace_rays(self.query(share=share), origin, direction, point, way, None, None)
+        _trace_rays(self.query(share=share), origin, direction, point, way, _ENDLESS, _NO_HIT)
         return share
 
     def blocked(
@@ -112,7 +116,7 @@ class Packets(embree.Triangles):
         A translucent surface stops a ray with the probability of its opacity, by a hash of the ray.
         """
         ray, hit = np.arange(len(origin)), np.zeros(len(origin), _HIT)
-        _trace_rays(self.query(_FIRST), origin, direction, ray, ray, None, hit)
+        _trace_rays(self.query(_FIRST), origin, direction, ray, ray, _ENDLESS, hit)
         face, stopped = np.full(len(origin), -1), np.flatnonzero(hit["geometry"] != embree.NONE)
         geometry, primitive = (hit[name][stopped] for name in ("geometry", "primitive"))
         face[stopped] = self._triangle[self._first[geometry] + primitive]
@@ -191,7 +195,7 @@ def _table(face: np.ndarray, layer: np.ndarray, opacity: Opacity) -> tuple[np.nd
 
 @numba_loop
 def _trace_rays(query, origin, direction, point, way, far, hit):
-    """Traces rays, with an end if `far` is not None. Finds what they hit, or if `hit` is None, sets shares to 0."""
+    """Traces rays, with one end or an end for each. Finds what they hit, or without room for it sets shares to 0."""
     ray, valid, share, _ = query
     number = ray.view(np.uint32)
     for first in range(0, len(point), 16):
@@ -202,11 +206,11 @@ def _trace_rays(query, origin, direction, point, way, far, hit):
             for axis in range(3):
                 ray[embree.ORIGIN + axis, lane] = origin[point[index], axis]
                 ray[embree.DIRECTION + axis, lane] = direction[way[index], axis]
-            ray[embree.FAR, lane] = embree.ENDLESS if far is None else far[index]
+            ray[embree.FAR, lane] = far[min(index, len(far) - 1)]
             number[embree.ID, lane], number[embree.GEOMETRY, lane] = index, embree.NONE
-        embree.trace(query, embree.RAY if hit is None else embree.RAY_HIT)
+        embree.trace(query, embree.RAY_HIT if len(hit) else embree.RAY)
         for lane in range(count):
-            if hit is not None:
+            if len(hit):
                 stop = hit[first + lane]
                 stop.distance, stop.geometry = ray[embree.FAR, lane], number[embree.GEOMETRY, lane]
                 if stop.geometry != embree.NONE:
@@ -352,4 +356,7 @@ def _filter_hits(argument):
             valid[lane] = 0
 
 
-_filter = embree.callback(types.void(types.voidptr), _filter_hits)
+@functools.cache
+def _compiled_filter() -> Any:
+    """The filter, which only scenes that are not opaque wait for."""
+    return embree.callback(types.void(types.voidptr), _filter_hits)

@@ -9,7 +9,6 @@ from jaxprt.compile import numba_loop
 from jaxprt.visibility import embree
 
 _ORIGINS = np.array([[-3, -1], [1, -3], [3, 1], [-1, 3]]) / 8  # ray origins in a pixel, from its center
-_GOLDEN = 0.618  # share of all rays between two turns
 _ENOUGH = 48  # rays of a packet that tell, if they agree, that others would agree with them
 _BLOCK = 128  # points whose rays to a texel are traced one packet after another
 _APART = 60  # 240ths by which corners of a triangle differ, above which what points between them see is traced
@@ -76,22 +75,18 @@ def trace_shares(query, surface, points, first, last, texels, stored, share):
         points: Triangle, barycentric coordinates, their slopes, and the number in the dither pattern of each point.
         first: Index of the first point.
         last: Index after the last point.
-        texels: Directions of the samples in each texel, of its middle, number of rays, and first sample.
+        texels: Directions of the samples in each texel, of its middle, number of rays, first sample, and step between rays.
         stored: Shares at vertices, which are interpolated where the corners of a point's triangle have about the same
             [v, t], and the corners [3, p]; no vertices to trace all.
         share: The result, in 240ths [t, p].
     """
-    _, middle, count, _ = texels
+    _, middle, count, _, step = texels
     origin, facing = np.zeros((4, 3, _BLOCK), np.float32), np.zeros((3, _BLOCK), np.float32)
     value, apart = np.zeros((_BLOCK, len(count)), np.uint8), np.ones((_BLOCK, len(count)), np.bool_)
     lane, visible = np.empty(_BLOCK, np.int64), np.empty(16)
-    step = np.empty(len(count), np.int64)  # between turns, so that the first ones are spread over the texel
     even = np.empty(len(count), np.int32)  # largest difference of corners between which shares are interpolated
     for texel in range(len(count)):
         even[texel] = _APART if count[texel] > 0 else 255
-        step[texel] = max(1, int(_GOLDEN * count[texel]))
-        while np.gcd(step[texel], count[texel]) > 1:
-            step[texel] += 1
     for block in range(first, last, _BLOCK):
         size = min(_BLOCK, last - block)
         for number in range(size):
@@ -111,7 +106,7 @@ def trace_shares(query, surface, points, first, last, texels, stored, share):
                     share[texel, block + number] = 0
             for packet in range(0, some, 16):
                 here = lane[packet : min(packet + 16, some)]
-                traced = _trace_texel(query, origin, points[3][block:], here, texel, texels, step[texel], visible)
+                traced = _trace_texel(query, origin, points[3][block:], here, texel, texels, visible)
                 for number in range(len(here)):
                     share[texel, block + here[number]] = np.uint8(np.floor(240 * visible[number] / traced + 0.5))
 
@@ -132,19 +127,18 @@ def _interpolate(stored, points, point, even, value, apart):
 
 
 @numba_loop
-def _trace_texel(query, origin, pattern, lane, texel, texels, step, visible):
+def _trace_texel(query, origin, pattern, lane, texel, texels, visible):
     """Number of rays from each of at most sixteen points of a block to a texel, and how many of them pass."""
     ray, valid, passed, _ = query
-    direction, _, count, shift = texels
+    direction, _, count, shift, step = texels
     strata, lanes = direction.shape[1], len(lane)
-    visible[:] = 0
     for number in range(16):
-        valid[number] = -1 if number < lanes else 0
+        valid[number], visible[number] = -1 if number < lanes else 0, 0
     traced = 0
     while traced < count[texel]:
         if 4 * traced >= count[texel] and _agree(visible, lanes, traced):
             break
-        turn = traced * step % count[texel]
+        turn = traced * step[texel] % count[texel]
         for number in range(16):
             here = lane[min(number, lanes - 1)]
             base = pattern[here]
@@ -153,7 +147,7 @@ def _trace_texel(query, origin, pattern, lane, texel, texels, step, visible):
             for axis in range(3):
                 ray[embree.ORIGIN + axis, number] = origin[spot, axis, here]
                 ray[embree.DIRECTION + axis, number] = direction[texel, stratum, axis]
-        ray[embree.FAR], passed[:] = embree.ENDLESS, 1
+            ray[embree.FAR, number], passed[number] = embree.ENDLESS, 1
         embree.trace(query, embree.RAY)
         for number in range(lanes):
             visible[number] += passed[number] if ray[embree.FAR, number] > 0 else 0.0

@@ -34,6 +34,7 @@ from jaxprt.visibility.occluder import Occluder, offsets
 FULL = 240  # share of a texel that is visible completely: sixteenths are whole numbers
 PLACES = 64  # places in each texel
 _PIECE = 1 << 11  # points that a thread traces at a time
+_GOLDEN = 0.618  # share of all rays of a texel between two that follow each other
 _BAYER = np.array([[0, 2], [3, 1]])
 for _ in range(2):
     _BAYER = np.block([[4 * _BAYER, 4 * _BAYER + 2], [4 * _BAYER + 3, 4 * _BAYER + 1]])
@@ -99,8 +100,12 @@ def shares(
     from jaxprt.visibility.picture_loops import trace_shares  # numba takes half a second to import
 
     # Texels start at different places, so that their dither patterns do not add up.
-    first = (np.arange(len(rays.per_texel)) * 37) % PLACES
-    texels = rays.direction, rays.direction.mean(1), np.asarray(rays.per_texel, np.int64), first
+    count, first = np.asarray(rays.per_texel, np.int64), (np.arange(len(rays.per_texel)) * 37) % PLACES
+    # Between rays, so that the first ones are spread over the texel.
+    step = np.maximum(1, (_GOLDEN * count).astype(np.int64))
+    while (common := np.gcd(step, count) > 1).any():
+        step += common
+    texels = rays.direction, rays.direction.mean(1), count, first, step
     share = np.empty((len(rays.per_texel), len(points.triangle)), np.uint8)
     if stored is None:
         stored = np.empty((0, len(share)), np.uint8), np.empty((3, 0), np.int64)

@@ -5,13 +5,14 @@ them outside of the solid would turn black towards it. It gets the visibility of
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int
 
 from jaxprt.scene.mesh import Mesh
 from jaxprt.scene.points import Points
 from jaxprt.visibility.occluder import Occluder, check, offsets
 
 _RAYS = 48  # rays over the hemisphere of a vertex, none of which leaves a solid
+_BATCHES = [1, 2, 4, 8, 16, 32]  # the first ones of rays that are traced together
 _INSIDE = 0.25  # share of these that hit a surface from behind; half of them do beside a second solid
 _STEEP = 0.5  # cosine between the normal and rays that count as steep
 _CLOSE = 1e-3  # distance of a sheet that covers a vertex, relative to the scene's diagonal
@@ -31,6 +32,7 @@ def out_of_solids(
     start: Float32[np.ndarray, "v 3"],
     out: Float32[np.ndarray, "v 3"],
     offset: Float32[np.ndarray, "v 1"],
+    wanted: Int[np.ndarray, " w"] | slice = slice(None),
 ) -> tuple[Float32[np.ndarray, "v 3"], Bool[np.ndarray, " v"]]:
     """Moves ray origins of vertices inside of solids to where their triangles come out of these.
 
@@ -45,11 +47,13 @@ def out_of_solids(
         start: Ray origins on the open side of the mesh's faces.
         out: Unit vectors off the surface.
         offset: Distance of the origins from the surface.
+        wanted: Vertices whose origins move; others keep theirs.
 
     Returns:
-        The ray origins, and whether each vertex is inside.
+        The ray origins, and whether each of the wanted vertices is inside; False for others.
     """
-    buried = inside(occluder, start, out)
+    buried = np.zeros(len(start), bool)
+    buried[wanted] = inside(occluder, start[wanted], out[wanted])
     if not buried.any():
         return start, buried
     vertex, goal = _escape_goals(mesh, start, buried)
@@ -81,14 +85,18 @@ def inside(
     side = np.cross(out, np.eye(3, dtype=np.float32)[np.argmin(np.abs(out), 1)])
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     other = np.cross(out, side)
-    for x, y, z in local:
-        way = x * side[hidden] + y * other[hidden] + z * out[hidden]
+    # Most points are told by the first ray. Later ones are traced several at a time, as few are left.
+    for ways in np.split(local, _BATCHES):
+        height = ways[:, 2:]
+        way = ways[:, :1, None] * side[hidden] + ways[:, 1:2, None] * other[hidden] + height[..., None] * out[hidden]
         # Where two faces coincide, `facing_hit` returns the front, so that rays count no backs on sheets.
-        triangle, distance, _ = occluder.facing_hit(start[hidden], way)
-        behind[hidden] += occluder.hits_back(triangle, way) & (triangle >= 0)
-        if z > _STEEP:
-            covered[hidden] &= distance * z < _CLOSE * occluder.diagonal
-        hidden = hidden[triangle >= 0]
+        flat = way.reshape(-1, 3)
+        triangle, distance, _ = occluder.facing_hit(np.tile(start[hidden], (len(ways), 1)), flat)
+        back = (occluder.hits_back(triangle, flat) & (triangle >= 0)).reshape(len(ways), -1)
+        close = distance.reshape(back.shape) * height < _CLOSE * occluder.diagonal
+        behind[hidden] += back.sum(0)
+        covered[hidden] &= (close | (height <= _STEEP)).all(0)
+        hidden = hidden[(triangle >= 0).reshape(back.shape).all(0)]
         if not hidden.size:
             break
     result = np.zeros(len(start), bool)
@@ -161,9 +169,14 @@ def start_points(
 
 
 def start_points_and_buried(
-    mesh: Mesh, occluder: Occluder, *, offset: Float[np.ndarray, " f"] | None = None, apart: bool = False
+    mesh: Mesh,
+    occluder: Occluder,
+    *,
+    offset: Float[np.ndarray, " f"] | None = None,
+    apart: bool = False,
+    wanted: Int[np.ndarray, " w"] | slice = slice(None),
 ) -> tuple[Float32[np.ndarray, "v 3"], Bool[np.ndarray, " v"]]:
-    """The result of `start_points`, and whether each vertex lies inside of another solid."""
+    """The result of `start_points`, and whether each of the wanted vertices lies inside of another solid."""
     check(mesh, "mesh")
     position, face = np.asarray(mesh.position, np.float32), np.asarray(mesh.face)
     out, steepness = _outward(mesh, apart)
@@ -177,7 +190,7 @@ def start_points_and_buried(
     exact = ~foreign
     if exact.any():
         start[exact] = _off_contact(occluder, position[exact], start[exact], out[exact], distance[exact])
-    return out_of_solids(mesh, occluder, start, out, distance)
+    return out_of_solids(mesh, occluder, start, out, distance, wanted)
 
 
 def _inward(position: np.ndarray, face: np.ndarray, out: np.ndarray) -> Float32[np.ndarray, "v 3"]:
