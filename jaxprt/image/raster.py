@@ -142,7 +142,7 @@ class Fragments(eqx.Module):
 
 @require.arguments(mesh=arguments.a_mesh, camera=arguments.a_camera, samples=arguments.samples)
 @in_common_coordinates
-@functools.partial(kept, static=("samples",))
+@functools.partial(kept, static=("samples",), quick=True)
 def rasterize(mesh: Mesh, camera: Camera, *, samples: int = 1) -> Fragments:
     """Finds the nearest triangle at the center of each pixel, or at four samples of each pixel.
 

@@ -129,11 +129,12 @@ class StoredFunction:
         function: A function whose arguments are arrays and pytrees of arrays. Static options are passed by name.
         compiled: The same function by `jax.jit`.
         static: Names of the static options.
+        quick: Whether to compile with XLA's older emitters of loops: see `jaxprt.compile.kept`.
     """
 
-    def __init__(self, function: Callable, compiled: Any, static: tuple[str, ...]):
+    def __init__(self, function: Callable, compiled: Any, static: tuple[str, ...], *, quick: bool = False):
         functools.update_wrapper(self, function)
-        self._function, self._compiled, self._static = function, compiled, static
+        self._function, self._compiled, self._static, self._quick = function, compiled, static, quick
         self._executables: dict[tuple, Callable] = {}
         self._locks: dict[tuple, contextlib.AbstractContextManager] = {}  # a lock for each signature
         _functions.append(self)
@@ -175,7 +176,7 @@ class StoredFunction:
         argument, named = operand
         aval = tuple((shape, str(dtype), weak) for shape, dtype, weak in aval)
         try:
-            parts = (surroundings(), *map(describe, (self._function, tree, aval, option)))
+            parts = (surroundings(), *map(describe, (self._function, tree, aval, option, self._quick)))
             name = hashlib.sha256("\n".join(parts).encode()).hexdigest()
         except Exception:  # no name, or none that can be found: classes of users may do anything
             return functools.partial(self._compiled, **option)
@@ -185,7 +186,7 @@ class StoredFunction:
                 return _unpack(content, tree)
         lowered = self._compiled.lower(*argument, **named, **option)
         with jax_cache.paused():  # An executable that comes from JAX's cache cannot be written again.
-            executable = lowered.compile()
+            executable = _compile(lowered, quick=self._quick)
         # Custom calls are addresses in this process, or need libraries that JAX prepares when it traces.
         if not _calls_out(lowered) and jax_cache.loads_quietly():
             with contextlib.suppress(Exception):
@@ -265,6 +266,13 @@ def _ordinary() -> bool:
         or config.default_device.value is not None
         or jax.process_count() > 1
     )
+
+
+def _compile(lowered: Any, *, quick: bool) -> jax.stages.Compiled:
+    if quick:
+        with contextlib.suppress(jax.errors.JaxRuntimeError):  # where XLA has these emitters no more
+            return lowered.compile({"xla_cpu_use_fusion_emitters": False})
+    return lowered.compile()
 
 
 def _calls_out(lowered: Any) -> bool:

@@ -78,7 +78,7 @@ class TexelLight(NamedTuple):
     samples: int
 
 
-@partial(kept, static=("glows", "finer"))
+@partial(kept, static=("glows", "finer"), quick=True)
 def view(
     surface: Surface,
     points: Points,

@@ -217,7 +217,7 @@ def at_vertices(vertex: Int[np.ndarray, " p"]) -> Points:
     return put(Points(np.stack([vertex] * 3), weight, np.zeros((2, *weight.shape), weight.dtype)))
 
 
-@kept
+@partial(kept, quick=True)
 def _evaluate(table: MaterialTable, points: Points) -> MaterialLook:
     values, layers = _values(table, points)
     normal = None

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import equinox as eqx
@@ -134,7 +134,7 @@ def _spread(width: np.ndarray) -> np.ndarray:
     return 1 - 1 / np.tanh(np.minimum(sharpness, 50)) + 1 / sharpness
 
 
-@kept
+@partial(kept, quick=True)
 def _prefilter(blurs: Sequence[tuple[Any, Any]], radiance: Float[Array, "6 n n c"]) -> Float[Array, "c t"]:
     """The light, blurred by lobes of all widths."""
     return _blurred(blurs, radiance)
