@@ -20,8 +20,10 @@ direct illumination and stochastic shadows", 2018). Where the first rays of sixt
 more are traced; in half-shadows, four times as many.
 """
 
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -131,8 +133,17 @@ def _trace(
         query = packets.query(share=np.empty(16, np.float32))
         loop(query, surface, drawn, first, min(first + _PIECE, count), *arguments)
 
-    with ThreadPoolExecutor(blocks.cores()) as pool:
-        list(pool.map(trace, range(0, count, _PIECE)))
+    list(_pool(blocks.cores()).map(trace, range(0, count, _PIECE)))
+
+
+@lru_cache(maxsize=1)
+def _pool(workers: int) -> ThreadPoolExecutor:
+    """Threads that stay, because a picture has many rows, and to start threads takes as long as their rays."""
+    return ThreadPoolExecutor(workers, thread_name_prefix="jaxprt-rays")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # threads stay behind in the parent
 
 
 class LampPlaces(NamedTuple):

@@ -142,7 +142,7 @@ def _addresses(face: Array, s: Array, t: Array, spread: Array, *, size: int) -> 
     # An address is the sum of one number for its row and one for its column. So is the bit, for scales stored as bits.
     address, bit = [], []
     for step in (0, 1):
-        edge, start = (jnp.asarray(x)[number + step] for x in (scale.edge, scale.start))
+        edge, start = (of_scale(x, number + step) for x in (scale.edge, scale.start))
         in_bits, fine = number + step < scale.bits, jnp.where(number + step == 0, 0, 1)
         place = []
         for center in (_nearest(edge, t), _nearest(edge, s)):
@@ -179,7 +179,7 @@ def _decode(
     number, upper = between(scale, spread)
     result = [jnp.zeros_like(spread)] * 3
     for step, part in ((0, 1 - upper), (1, upper)):
-        first, edge = bit[2 * step * _TAPS :], jnp.asarray(scale.edge)[number + step]
+        first, edge = bit[2 * step * _TAPS :], of_scale(scale.edge, number + step)
 
         def seen(i, j, step=step, bit=first, number=number + step):
             place = bit[i] + bit[_TAPS + j]
@@ -261,10 +261,15 @@ class Scales(NamedTuple):
 
 def between(scale: Scales, spread: Array) -> tuple[Array, Array]:
     """Index of the scale below each spread, and the weight of the scale above."""
-    known = jnp.asarray(scale.spread, spread.dtype)
-    number = jnp.sum(spread[..., None] >= known[1:-1], -1)
-    low, high = known[number], known[number + 1]
+    known = np.asarray(scale.spread, spread.dtype)
+    number = sum((spread >= least).astype(jnp.int32) for least in known[1:-1])
+    low, high = of_scale(known[:-1], number), of_scale(known[1:], number)
     return number, jnp.clip((spread - low) / (high - low), 0, 1)
+
+
+def of_scale(table: np.ndarray, number: Int[Array, "*b"]) -> Array:
+    """What a table says of scales. XLA on CPUs vectorizes comparisons with all of them, but no gathers."""
+    return reduce(lambda found, row: jnp.where(number >= row[0], row[1], found), enumerate(table), table[0])
 
 
 def corners(edge: Array, s: Array, t: Array) -> tuple[Array, Array, list]:

@@ -28,7 +28,7 @@ from jaxprt.systems.lobe import diffuse
 from jaxprt.systems.lobe import squares as over_squares
 from jaxprt.systems.lobe.blurred_light import LobeLight, finer_scales, prefilter, scales
 from jaxprt.systems.lobe.exported import DEGREE, CoarseTransport, ExportedLobes
-from jaxprt.systems.lobe.pyramid import LobeTransport, Scales, between, corners
+from jaxprt.systems.lobe.pyramid import LobeTransport, Scales, between, corners, of_scale
 from jaxprt.systems.lobe.table import LobeBrdf, LobeMixture, traced_visibility
 from jaxprt.systems.protocol import Blend
 
@@ -338,7 +338,7 @@ def _blurred(face: Array, s: Array, t: Array, spread: Array, scale: Scales) -> l
     result = []
     number, upper = between(scale, spread)
     for step, part in ((0, 1 - upper), (1, upper)):
-        edge, start = (jnp.asarray(x)[number + step] for x in (scale.edge, scale.start))
+        edge, start = (of_scale(x, number + step) for x in (scale.edge, scale.start))
         row, column, weights = corners(edge, s, t)
         for (down, right), (value, _, _) in weights:
             place = start + (face * (edge + 2) + row + down) * (edge + 2) + column + right
