@@ -19,6 +19,7 @@ Heitz 2014, "Understanding the masking-shadowing function in microfacet-based BR
 anisotropic D and G; Burley 2012, "Physically based shading at Disney", for alpha = roughness^2.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import ClassVar
 
@@ -104,9 +105,21 @@ class GGX(Model):
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the BRDF in 1/sr."""
-        along, across = _alpha(self.roughness)
-        lobe, cos_d = _lobe(wi, wo, along, across, self.rotation)
-        return jnp.where(both_above(wi, wo), lobe * (self.f0 + (1 - self.f0) * _schlick_weight(cos_d)), 0)
+        return of_f0([self], wi, wo)[0]
+
+
+def differ_in_f0(one: Model, other: Model) -> bool:
+    """Whether two models are lobes of `GGX` with the same arrays but f0."""
+    both = isinstance(one, GGX) and isinstance(other, GGX)
+    return both and one.roughness is other.roughness and one.rotation is other.rotation
+
+
+def of_f0(lobes: Sequence[GGX], wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> list[Float[Array, "*b _"]]:
+    """Values of lobes that differ in f0, for which all else is computed once."""
+    along, across = _alpha(lobes[0].roughness)
+    lobe, cos_d = _lobe(wi, wo, along, across, lobes[0].rotation)
+    above, rise = both_above(wi, wo), _schlick_weight(cos_d)
+    return [jnp.where(above, lobe * (model.f0 + (1 - model.f0) * rise), 0) for model in lobes]
 
 
 class GGXInterface(Model):
