@@ -412,18 +412,22 @@ def _divided(
 ) -> tuple[Any, ...]:
     """Member masks without samples that become four points; and of each point its sample, triangle, column and row."""
     member, triangle = np.array(members), np.asarray(fragments.triangle).reshape(members.shape)
-    flat = (detail[triangle] == FACET) & (triangle >= 0) & np.asarray(facing)[triangle]
-    here = np.where(member > 0, detail[triangle] % FACET, 0)
+    # Pixels of which a sample shows a surface that is flat or needs four points; four flags are one number.
+    near = np.flatnonzero((detail > 1)[triangle].view(np.uint32))
+    shown = triangle[near]
+    flat = (detail[shown] == FACET) & (shown >= 0) & np.asarray(facing)[shown]
+    here = np.where(member[near] > 0, detail[shown] % FACET, 0)
     if share is not None:
-        whole = np.all(np.asarray(share).reshape(*here.shape, -1) == 1, -1)
+        whole = np.all(np.asarray(share).reshape(*member.shape, -1)[near] == 1, -1)
         here, flat = np.where(whole, here, 0), flat & whole
-    apart = np.all(flat, 1) & (np.count_nonzero(member, 1) > 1)
-    pixel = np.flatnonzero(np.any(here > 1, 1) | apart)
-    if len(pixel) > len(here) // 2:  # what is kept of a view holds a kilobyte for each point
-        pixel = pixel[(pixel // camera.width + pixel % camera.width) % 2 == 0]
+    apart = np.all(flat, 1) & (np.count_nonzero(member[near], 1) > 1)
+    chosen = np.flatnonzero(np.any(here > 1, 1) | apart)
+    if len(chosen) > len(member) // 2:  # what is kept of a view holds a kilobyte for each point
+        pixel = near[chosen]
+        chosen = chosen[(pixel // camera.width + pixel % camera.width) % 2 == 0]
     # All single samples of a pixel or none: their distances from the middles of their quarters cancel.
-    row, number = np.nonzero((here[pixel] > 0) | apart[pixel, None])
-    sample = np.repeat((4 * pixel[row] + number).astype(np.int32), 4)
+    row, number = np.nonzero((here[chosen] > 0) | apart[chosen, None])
+    sample = np.repeat((4 * near[chosen[row]] + number).astype(np.int32), 4)
     chunks = [sample[first : first + _RAYS] for first in range(0, len(sample), _RAYS)]
     parts = [_places(chunk, triangle.ravel(), mesh, camera, np.asarray(facing), occluder) for chunk in chunks]
     if not parts:
