@@ -66,7 +66,7 @@ def _edge_vector(position, first, last):
 
 
 @numba_loop
-def trace_shares(query, surface, points, first, last, texels, stored, share):
+def trace_shares(query, surface, points, first, last, texels, stored, share, memory):
     """Visible shares of texels at points of a picture.
 
     Args:
@@ -79,12 +79,10 @@ def trace_shares(query, surface, points, first, last, texels, stored, share):
         stored: Shares at vertices, which are interpolated where the corners of a point's triangle have about the same
             [v, t], and the corners [3, p]; no vertices to trace all.
         share: The result, in 240ths [t, p].
+        memory: Arrays from `share_memory`: numba would compile for a second to make them.
     """
-    _, middle, count, _, step = texels
-    origin, facing = np.zeros((4, 3, _BLOCK), np.float32), np.zeros((3, _BLOCK), np.float32)
-    value, apart = np.zeros((_BLOCK, len(count)), np.uint8), np.ones((_BLOCK, len(count)), np.bool_)
-    lane, visible = np.empty(_BLOCK, np.int64), np.empty(16)
-    even = np.empty(len(count), np.int32)  # largest difference of corners between which shares are interpolated
+    middle, count = texels[1], texels[2]
+    origin, facing, value, apart, lane, visible, even = memory
     for texel in range(len(count)):
         even[texel] = _APART if count[texel] > 0 else 255
     for block in range(first, last, _BLOCK):
@@ -109,6 +107,16 @@ def trace_shares(query, surface, points, first, last, texels, stored, share):
                 traced = _trace_texel(query, origin, points[3][block:], here, texel, texels, visible)
                 for number in range(len(here)):
                     share[texel, block + here[number]] = np.uint8(np.floor(240 * visible[number] / traced + 0.5))
+
+
+def share_memory(texels: int) -> tuple[np.ndarray, ...]:
+    """What `trace_shares` keeps of a block: ray origins and normals; shares and if rays decide; points, and hits.
+
+    The last array is the largest difference of corners between which shares of a texel are interpolated.
+    """
+    origin, facing = np.zeros((4, 3, _BLOCK), np.float32), np.zeros((3, _BLOCK), np.float32)
+    value, apart = np.zeros((_BLOCK, texels), np.uint8), np.ones((_BLOCK, texels), np.bool_)
+    return origin, facing, value, apart, np.empty(_BLOCK, np.int64), np.empty(16), np.empty(texels, np.int32)
 
 
 @numba_loop

@@ -24,7 +24,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int64, Integer, UInt8
@@ -99,7 +99,7 @@ def shares(
         stored: Shares at vertices, and the corners of the triangle of each point among these vertices. Where the
             corners have about the same, it is interpolated, without rays; None to trace all.
     """
-    from jaxprt.visibility.picture_loops import trace_shares  # numba takes half a second to import
+    from jaxprt.visibility.picture_loops import share_memory, trace_shares  # numba takes half a second to import
 
     # Texels start at different places, so that their dither patterns do not add up.
     count, first = np.asarray(rays.per_texel, np.int64), (np.arange(len(rays.per_texel)) * 37) % PLACES
@@ -112,7 +112,11 @@ def shares(
     if stored is None:
         stored = np.empty((0, len(share)), np.uint8), np.empty((3, 0), np.int64)
     seen, corner = (np.ascontiguousarray(*pair) for pair in zip(stored, (np.uint8, np.int64), strict=True))
-    _trace(trace_shares, surface, occluder, points, texels, (seen, corner), share)
+
+    def loop(*arguments: Any) -> None:
+        trace_shares(*arguments, share_memory(len(share)))
+
+    _trace(loop, surface, occluder, points, texels, (seen, corner), share)
     return share
 
 
