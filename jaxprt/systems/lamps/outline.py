@@ -15,8 +15,7 @@ from functools import reduce
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
-import scipy.spatial
+import scipy
 from jaxtyping import Array, Float
 
 from jaxprt.compile import jit, put, total
