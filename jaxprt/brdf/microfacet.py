@@ -110,8 +110,9 @@ class GGX(Model):
 
 def differ_in_f0(one: Model, other: Model) -> bool:
     """Whether two models are lobes of `GGX` with the same arrays but f0."""
-    both = isinstance(one, GGX) and isinstance(other, GGX)
-    return both and one.roughness is other.roughness and one.rotation is other.rotation
+    if not (isinstance(one, GGX) and isinstance(other, GGX)):
+        return False
+    return one.roughness is other.roughness and one.rotation is other.rotation
 
 
 def of_f0(lobes: Sequence[GGX], wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> list[Float[Array, "*b _"]]:

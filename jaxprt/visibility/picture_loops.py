@@ -75,7 +75,7 @@ def trace_shares(query, surface, points, first, last, texels, stored, share, mem
         points: Triangle, barycentric coordinates, their slopes, and the number in the dither pattern of each point.
         first: Index of the first point.
         last: Index after the last point.
-        texels: Directions of the samples in each texel, of its middle, number of rays, first sample, and step between rays.
+        texels: Directions of the samples in each texel, of its middle, number of rays, first sample, and step.
         stored: Shares at vertices, which are interpolated where the corners of a point's triangle have about the same
             [v, t], and the corners [3, p]; no vertices to trace all.
         share: The result, in 240ths [t, p].

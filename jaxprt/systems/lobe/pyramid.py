@@ -262,7 +262,7 @@ class Scales(NamedTuple):
 def between(scale: Scales, spread: Array) -> tuple[Array, Array]:
     """Index of the scale below each spread, and the weight of the scale above."""
     known = np.asarray(scale.spread, spread.dtype)
-    number = sum((spread >= least).astype(jnp.int32) for least in known[1:-1])
+    number = reduce(jnp.add, ((spread >= least).astype(jnp.int32) for least in known[1:-1]))
     low, high = of_scale(known[:-1], number), of_scale(known[1:], number)
     return number, jnp.clip((spread - low) / (high - low), 0, 1)
 
