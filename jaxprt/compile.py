@@ -23,10 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax._src import xla_bridge
 from jax._src.core import trace_state_clean
+from jax._src.lib import version_str
 from jax.core import Tracer
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-from jaxlib import version as jaxlib_version
 from jaxtyping import Array, Bool, PyTree
 
 from jaxprt.programs import executables, jax_cache
@@ -43,7 +43,7 @@ _ROOM = 1 << 28  # bytes of results that loops compute at once on GPUs
 _FLAG = "--xla_cpu_experimental_ynn_fusion_type="
 _CANARIES = (32_769, 40_000)  # numbers of rows at which jaxlib 0.10.2 is wrong; at 10,000 and 100,000 it is right
 _flags = os.environ.get("XLA_FLAGS", "").split()
-if jaxlib_version.__version__ == "0.10.2" and _FLAG not in _flags:
+if version_str == "0.10.2" and _FLAG not in _flags:
     if xla_bridge.backends_are_initialized() or any(flag.startswith(_FLAG) for flag in _flags):
         warnings.warn(
             f"jaxlib 0.10.2 computes wrong sums on CPUs (jax-ml/jax#39103) unless XLA_FLAGS={_FLAG} is set before the "

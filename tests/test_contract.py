@@ -63,7 +63,7 @@ REASONS = {
         systems.dynamic.table.tabulate systems.separable.factorization.tabulate image.arguments
         scene.camera.in_common_coordinates scene.environment.environment_from_image scene.light_probes.irradiance
     """,
-    "takes functions": "compile",
+    "takes functions": "compile brdf.microfacet.values",
     "reads or writes files, or runs workers": """
         programs cli brdf.fitted view files visibility.blocks systems.separable.clustered.precompute
         systems.harmonic.exchange brdf.scattered brdf.measured.load_merl brdf.measured.load_npf
@@ -110,7 +110,7 @@ REASONS = {
     "a NumPy table, or an index in one": """
         sphere.hats.centers sphere.hats.table sphere.hats.inverse_gram systems.lobe.pyramid.scales
         systems.lobe.pyramid.between systems.lobe.pyramid.corners systems.lobe.blurred_light.scales
-        systems.lobe.blurred_light.finer_scales
+        systems.lobe.blurred_light.finer_scales systems.lobe.pyramid.of_scale
         visibility.members.places sphere.cubemap.axes brdf.measured.cell_angles brdf.measured.lower_cosine
         brdf.measured.tabulate sphere.cubemap.border_index sphere.harmonics.quadrature
     """,

@@ -390,6 +390,17 @@ def test_an_executable_is_loaded_without_tracing(kept_files, monkeypatch):
     np.testing.assert_array_equal(later(camera()), expected)
 
 
+def test_an_executable_compiled_quickly_is_another_one(kept_files):
+    expected = np.asarray(kept(axes)(camera()))
+    np.testing.assert_allclose(kept(axes, quick=True)(camera()), expected, rtol=1e-6)
+    assert len(list(kept_files.folder.iterdir())) == 2
+
+
+def test_an_option_that_the_compiler_lacks_is_left_out(kept_files, monkeypatch):
+    monkeypatch.setattr(executables, "_QUICK", {"xla_cpu_emitters_of_no_version": False})
+    assert kept(axes, quick=True)(camera()).shape == (3, 3)
+
+
 def test_an_executable_that_cannot_be_loaded_again_is_not_kept(kept_files, monkeypatch):
     def fail(*_, **__):
         raise RuntimeError("NOT_FOUND: Function sub.7_kernel not found")
@@ -591,12 +602,13 @@ def test_every_loop_of_the_package_is_kept_under_a_name_of_its_own(loop_files, m
     every = [value for module in modules for value in vars(module).values() if hasattr(value, "_cache")]
     assert len(every) > 30
     assert len({loops.describe(loop) for loop in every}) == len(every)
-    before = loops.describe(packets._filter)
+    hits = packets._compiled_filter()
+    before = loops.describe(hits)
     turned = np.dtype([(name, "i8") for name in reversed(packets._TABLE.names)])
     for name, value in {"_CLEAR": 2 * packets._CLEAR, "_TABLE": turned}.items():
         with monkeypatch.context() as patch:
-            patch.setattr(packets, name, value)  # which `_alpha` reads, and `_filter` calls
-            assert loops.describe(packets._filter) != before
+            patch.setattr(packets, name, value)  # which `_alpha` reads, and the filter calls
+            assert loops.describe(hits) != before
 
 
 def test_a_function_that_c_calls_is_kept_too(loop_files):

@@ -19,9 +19,10 @@ Heitz 2014, "Understanding the masking-shadowing function in microfacet-based BR
 anisotropic D and G; Burley 2012, "Physically based shading at Disney", for alpha = roughness^2.
 """
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -105,18 +106,35 @@ class GGX(Model):
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b c"]:
         """Value of the BRDF in 1/sr."""
-        return of_f0([self], wi, wo)[0]
+        return _of_f0([self], wi, wo)[0]
 
 
-def differ_in_f0(one: Model, other: Model) -> bool:
-    """Whether two models are lobes of `GGX` with the same arrays but f0."""
+def values(
+    models: Sequence[Callable], wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]
+) -> list[Float[Array, "*b _"]]:
+    """Values of several models. Neighboring lobes of `GGX` with the same arrays but f0 share what they compute.
+
+    Args:
+        models: BRDFs (wi, wo) -> value [*b c] in 1/sr.
+        wi: Unit directions to the light.
+        wo: Unit directions to the viewer.
+    """
+    result, rest = [], list(models)
+    while rest:
+        alike = 1 + sum(1 for _ in itertools.takewhile(partial(_differ_in_f0, rest[0]), rest[1:]))
+        result += _of_f0(rest[:alike], wi, wo) if alike > 1 else [rest[0](wi, wo)]
+        del rest[:alike]
+    return result
+
+
+def _differ_in_f0(one: Callable, other: Callable) -> bool:
     if not (isinstance(one, GGX) and isinstance(other, GGX)):
         return False
     return one.roughness is other.roughness and one.rotation is other.rotation
 
 
-def of_f0(lobes: Sequence[GGX], wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> list[Float[Array, "*b _"]]:
-    """Values of lobes that differ in f0, for which all else is computed once."""
+def _of_f0(lobes: Sequence[Any], wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> list[Float[Array, "*b _"]]:
+    """Values of lobes that differ in f0."""
     along, across = _alpha(lobes[0].roughness)
     lobe, cos_d = _lobe(wi, wo, along, across, lobes[0].rotation)
     above, rise = both_above(wi, wo), _schlick_weight(cos_d)

@@ -1,8 +1,6 @@
 """BRDFs that vary over a surface: one model per vertex, and several gray BRDFs as channels."""
 
-import itertools
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -11,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxprt import require
-from jaxprt.brdf.microfacet import differ_in_f0, of_f0
+from jaxprt.brdf.microfacet import values
 from jaxprt.compile import jit
 
 
@@ -65,9 +63,5 @@ class Channels(eqx.Module):
 
     def __call__(self, wi: Float[Array, "*b 3"], wo: Float[Array, "*b 3"]) -> Float[Array, "*b k"]:
         """Values in 1/sr, times the scales."""
-        values, models = [], list(self.model)
-        while models:
-            alike = 1 + sum(1 for _ in itertools.takewhile(partial(differ_in_f0, models[0]), models[1:]))
-            values += of_f0(models[:alike], wi, wo) if alike > 1 else [models[0](wi, wo)]
-            del models[:alike]
-        return jnp.concatenate([value * jnp.asarray(self.scale)[k] for k, value in enumerate(values)], -1)
+        value = values(self.model, wi, wo)
+        return jnp.concatenate([part * jnp.asarray(self.scale)[k] for k, part in enumerate(value)], -1)

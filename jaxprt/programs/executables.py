@@ -38,6 +38,7 @@ _PACKAGE = pathlib.Path(__file__).parents[1]
 _STARTED = time.time()
 _KNOWN = ("builtins", "jaxprt", "equinox", "numpy", "jax", "jaxlib", "collections")  # packages whose code has a version
 _CLEAN = re.compile(r"<jax\._src\.core\.AxisEnv object at 0x[0-9a-f]+>")  # empty where no trace is under way
+_QUICK = {"xla_cpu_use_fusion_emitters": False}  # the older emitters of loops
 _functions: list["StoredFunction"] = []
 _MAPS, _MOST = pathlib.Path("/proc/self/maps"), pathlib.Path("/proc/sys/vm/max_map_count")
 _FILLED = 0.7  # share of the memory mappings at which programs are forgotten
@@ -271,7 +272,7 @@ def _ordinary() -> bool:
 def _compile(lowered: Any, *, quick: bool) -> jax.stages.Compiled:
     if quick:
         with contextlib.suppress(jax.errors.JaxRuntimeError):  # where XLA has these emitters no more
-            return lowered.compile({"xla_cpu_use_fusion_emitters": False})
+            return lowered.compile(_QUICK)
     return lowered.compile()
 
 

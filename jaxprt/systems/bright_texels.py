@@ -496,10 +496,7 @@ def texel_radiance(
         direction, area, number = argument
         share = visible[number] if carried else points.carry(visible[number])
         channel, cosine = point(direction, area)
-        if weight is None:
-            reflected = jnp.stack(channel)
-        else:
-            reflected = sum(value * factor for value, factor in zip(channel, weight, strict=True))
+        reflected = jnp.stack(channel) if weight is None else sum(map(jnp.multiply, channel, weight))
         return reflected * (cosine * share.astype(wo.dtype)) * excess[number][:, None]
 
     def counts(rows):

@@ -32,6 +32,7 @@ def out_of_solids(
     start: Float32[np.ndarray, "v 3"],
     out: Float32[np.ndarray, "v 3"],
     offset: Float32[np.ndarray, "v 1"],
+    *,
     wanted: Int[np.ndarray, " w"] | slice = slice(None),
 ) -> tuple[Float32[np.ndarray, "v 3"], Bool[np.ndarray, " v"]]:
     """Moves ray origins of vertices inside of solids to where their triangles come out of these.
@@ -190,7 +191,7 @@ def start_points_and_buried(
     exact = ~foreign
     if exact.any():
         start[exact] = _off_contact(occluder, position[exact], start[exact], out[exact], distance[exact])
-    return out_of_solids(mesh, occluder, start, out, distance, wanted)
+    return out_of_solids(mesh, occluder, start, out, distance, wanted=wanted)
 
 
 def _inward(position: np.ndarray, face: np.ndarray, out: np.ndarray) -> Float32[np.ndarray, "v 3"]:

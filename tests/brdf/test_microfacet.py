@@ -7,6 +7,7 @@ import pytest
 from scipy import integrate
 
 from jaxprt.brdf import GGX, GGXInterface, Lambert, MetallicRoughness
+from jaxprt.brdf.microfacet import values
 from tests.upper import albedo, evaluate, highlights, pairs, unit
 
 GOLD = np.array([1.0, 0.78, 0.34])
@@ -213,6 +214,20 @@ def test_the_split_equals_the_whole(x64, close):
     under, lobe, rim, _ = np.moveaxis(split, 1, 0)
     expected = base * (1 - metallic) * 0.96 * under + ((1 - metallic) * 0.04 + metallic * base) * (lobe - rim) + rim
     close(evaluate(plain, wi, wo), expected)
+
+
+def test_lobes_that_differ_in_f0_share_the_rest(x64, close):
+    wi, wo = map(jnp.asarray, pairs(50))
+    material = _textured(roughness=0.3, anisotropy=0.6, rotation=0.7)
+
+    def together(wi, wo):
+        return jnp.concatenate(values(material.terms(), wi, wo), -1)
+
+    apart = [term(wi, wo) for term in material.terms()]
+    close(together(wi, wo), np.concatenate(apart, -1))
+    base, lobe, *_ = material.terms()
+    roots = [str(jax.make_jaxpr(function)(wi, wo)).count("sqrt") for function in (base, lobe, together)]
+    assert roots[2] == roots[0] + roots[1] > 0
 
 
 def test_terms_that_nothing_needs_are_left_out(x64, close):

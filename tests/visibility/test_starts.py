@@ -32,7 +32,8 @@ def moved(mesh, scene, monkeypatch):
     occluder = Occluder(scene)
     found = starts.start_points(mesh, occluder)
     with monkeypatch.context() as patch:
-        patch.setattr(starts, "out_of_solids", lambda mesh, occluder, start, *more: (start, np.zeros(len(start), bool)))
+        none = np.zeros(len(mesh.position), bool)
+        patch.setattr(starts, "out_of_solids", lambda mesh, occluder, start, *_, wanted: (start, none))
         before = starts.start_points(mesh, occluder)
     return found, np.any(found != before, axis=1)
 
@@ -48,6 +49,17 @@ def test_rays_of_a_buried_root_start_where_the_wing_comes_out(monkeypatch):
     # Still on the wing's surface, a rounding above it.
     above = np.sum((place - position[elsewhere]) * normal[elsewhere], 1)
     assert np.all((above > 0) & (above < 1e-5))
+
+
+def test_vertices_that_are_not_wanted_stay_where_they_are():
+    scene = join([CUBE, WING])
+    whole, buried = starts.start_points_and_buried(WING, Occluder(scene))
+    wanted = np.flatnonzero(buried)[::2]
+    start, inside = starts.start_points_and_buried(WING, Occluder(scene), wanted=wanted)
+    np.testing.assert_array_equal(np.flatnonzero(inside), wanted)
+    np.testing.assert_array_equal(start[wanted], whole[wanted])
+    others = np.setdiff1d(np.flatnonzero(buried), wanted)
+    assert np.any(start[others] != whole[others])
 
 
 def test_the_visibility_of_a_buried_root_is_that_beside_the_wall():

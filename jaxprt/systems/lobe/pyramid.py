@@ -269,7 +269,7 @@ def between(scale: Scales, spread: Array) -> tuple[Array, Array]:
 
 def of_scale(table: np.ndarray, number: Int[Array, "*b"]) -> Array:
     """What a table says of scales. XLA on CPUs vectorizes comparisons with all of them, but no gathers."""
-    return reduce(lambda found, row: jnp.where(number >= row[0], row[1], found), enumerate(table), table[0])
+    return reduce(lambda value, row: jnp.where(number >= row[0], row[1], value), enumerate(table), table[0])
 
 
 def corners(edge: Array, s: Array, t: Array) -> tuple[Array, Array, list]:
