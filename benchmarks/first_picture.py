@@ -14,7 +14,7 @@ threads of the process have used. `programs` are compiled or found in the folder
 `bytes` are the memory mappings of the process and its peak memory at the end of the step. `error` is the relative L2
 difference of the stage's first picture from that of `cold`.
 
-`truck` and `duck` are files of JAXPRT_DATA. `chess` has three parts, `room` twelve, with two bounces. `hundred` has 100
+`truck`, `duck`, `spaceship` and `cake` are files of JAXPRT_DATA. `chess` has three parts, `room` twelve, with two bounces. `hundred` has 100
 spheres of ten sizes of mesh as parts, and `one` has the same 100 spheres as a single part.
 """
 
@@ -41,7 +41,10 @@ from jaxprt.scene.mesh import join, make_mesh, split
 
 WIDTH, HEIGHT, SAMPLES, SIZE = 320, 240, 4, 64
 LIGHTS = "uffizi_latlong_256x128.hdr", "ennis_latlong_256x128.hdr"
-FILES = {"truck": "CesiumMilkTruck.glb", "duck": "Duck.glb"}
+FILES = {
+    **{"truck": "scenes/CesiumMilkTruck.glb", "duck": "scenes/Duck.glb"},
+    **{"spaceship": "foreign/alien.glb", "cake": "foreign/cakeBirthday.glb"},
+}
 SCENES = (*FILES, "chess", "room", "hundred", "one")
 STAGES = "cold", "programs", "store", "cameras"
 BOUNCES = {"room": 2}
@@ -72,7 +75,7 @@ def main(options: Sequence[str] | None = None) -> None:
 
 def available(name: str) -> bool:
     """Whether a scene's file is there, or it needs none."""
-    return name not in FILES or (harness.data() / "scenes" / FILES[name]).is_file()
+    return name not in FILES or (harness.data() / FILES[name]).is_file()
 
 
 def measure(name: str, stages: Sequence[str], quick: bool) -> Iterator[dict[str, Any]]:
@@ -196,7 +199,7 @@ def environment(number: int, quick: bool) -> prt.scene.Environment:
 def load(name: str) -> Scene:
     """The scene of a name."""
     if name in FILES:
-        return prt.load_scene(harness.data() / "scenes" / FILES[name])
+        return prt.load_scene(harness.data() / FILES[name])
     if name == "chess":
         return parts(split(builtin.chess()), [([0.6, 0.4, 0.2], 0.3), ([0.8, 0.7, 0.5], 0.5), ([0.1, 0.05, 0.03], 0.5)])
     if name == "room":
