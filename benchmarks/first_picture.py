@@ -14,8 +14,8 @@ threads of the process have used. `programs` are compiled or found in the folder
 `bytes` are the memory mappings of the process and its peak memory at the end of the step. `error` is the relative L2
 difference of the stage's first picture from that of `cold`.
 
-`truck`, `duck`, `spaceship` and `cake` are files of JAXPRT_DATA. `chess` has three parts, `room` twelve, with two bounces. `hundred` has 100
-spheres of ten sizes of mesh as parts, and `one` has the same 100 spheres as a single part.
+`truck`, `duck`, `spaceship` and `cake` are files of JAXPRT_DATA. `chess` has three parts, `room` twelve, with two
+bounces. `hundred` has 100 spheres of ten sizes of mesh as parts, and `one` has the same 100 spheres as a single part.
 """
 
 import argparse
@@ -42,8 +42,10 @@ from jaxprt.scene.mesh import join, make_mesh, split
 WIDTH, HEIGHT, SAMPLES, SIZE = 320, 240, 4, 64
 LIGHTS = "uffizi_latlong_256x128.hdr", "ennis_latlong_256x128.hdr"
 FILES = {
-    **{"truck": "scenes/CesiumMilkTruck.glb", "duck": "scenes/Duck.glb"},
-    **{"spaceship": "foreign/alien.glb", "cake": "foreign/cakeBirthday.glb"},
+    "truck": "scenes/CesiumMilkTruck.glb",
+    "duck": "scenes/Duck.glb",
+    "spaceship": "foreign/alien.glb",
+    "cake": "foreign/cakeBirthday.glb",
 }
 SCENES = (*FILES, "chess", "room", "hundred", "one")
 STAGES = "cold", "programs", "store", "cameras"
