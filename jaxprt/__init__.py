@@ -25,51 +25,28 @@ Conventions, everywhere in this package:
   Masked arrays, text, booleans and complex numbers are refused. Light in memory may be negative: relighting is linear.
 """
 
-from jaxprt import brdf, decompose, files, image, inverse, relit, scene, sphere, view, visibility
-from jaxprt.relit import RelitScene, plan, precompute, refine, register
-from jaxprt.scene import Camera, Environment, Part, Scene, load_environment, load_mesh, load_scene
-from jaxprt.systems import bounces, bright_texels, dynamic, harmonic, lamps, lobe, reference, separable
-from jaxprt.systems.devices import shard
-from jaxprt.systems.protocol import Blend, System, memory, radiance, total
-from jaxprt.visibility import Run
+import importlib.util
+from typing import TYPE_CHECKING, Any
 
-__all__ = [
-    "Blend",
-    "Camera",
-    "Environment",
-    "Part",
-    "RelitScene",
-    "Run",
-    "Scene",
-    "System",
-    "bounces",
-    "brdf",
-    "bright_texels",
-    "decompose",
-    "dynamic",
-    "files",
-    "harmonic",
-    "image",
-    "inverse",
-    "lamps",
-    "load_environment",
-    "load_mesh",
-    "load_scene",
-    "lobe",
-    "memory",
-    "plan",
-    "precompute",
-    "radiance",
-    "reference",
-    "refine",
-    "register",
-    "relit",
-    "scene",
-    "separable",
-    "shard",
-    "sphere",
-    "total",
-    "view",
-    "visibility",
-]
+from jaxprt.programs import xla_flags
+
+if TYPE_CHECKING:
+    from jaxprt.public import *  # noqa: F403
+
 __version__ = "0.3.0"
+xla_flags.set_up()
+
+
+def __getattr__(name: str) -> Any:
+    """A module of the package, or a name of `jaxprt.public`: imported when it is used, which takes a second."""
+    if name == "__all__" or not name.startswith("_"):
+        if importlib.util.find_spec(f"{__name__}.{name}"):
+            return importlib.import_module(f"{__name__}.{name}")
+        public = importlib.import_module(f"{__name__}.public")
+        if hasattr(public, name):
+            return globals().setdefault(name, getattr(public, name))
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__getattr__("__all__")})

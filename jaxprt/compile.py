@@ -11,8 +11,6 @@ the transpose of a gather is a scatter, which is slower. All of these work under
 import contextlib
 import functools
 import inspect
-import os
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial, reduce
@@ -21,9 +19,7 @@ from typing import Any, TypeVar, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax._src import xla_bridge
 from jax._src.core import trace_state_clean
-from jax._src.lib import version_str
 from jax.core import Tracer
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -38,20 +34,7 @@ Function = TypeVar("Function", bound=Callable)
 TOGETHER = 16  # rows of a sum that CPUs skip together
 _ROOM = 1 << 28  # bytes of results that loops compute at once on GPUs
 
-# jaxlib 0.10.2, the newest for Python 3.11, fuses sums of products wrongly on CPUs (jax-ml/jax#39103). Without these
-# fusions it is right, and no slower. Flags are read when the first array is made.
-_FLAG = "--xla_cpu_experimental_ynn_fusion_type="
-_CANARIES = (32_769, 40_000)  # numbers of rows at which jaxlib 0.10.2 is wrong; at 10,000 and 100,000 it is right
-_flags = os.environ.get("XLA_FLAGS", "").split()
-if version_str == "0.10.2" and _FLAG not in _flags:
-    if xla_bridge.backends_are_initialized() or any(flag.startswith(_FLAG) for flag in _flags):
-        warnings.warn(
-            f"jaxlib 0.10.2 computes wrong sums on CPUs (jax-ml/jax#39103) unless XLA_FLAGS={_FLAG} is set before the "
-            "first array is made: import jaxprt before that, or set the variable",
-            stacklevel=2,
-        )
-    if not any(flag.startswith(_FLAG) for flag in _flags):
-        os.environ["XLA_FLAGS"] = " ".join([*_flags, _FLAG])
+_CANARIES = (32_769, 40_000)  # numbers of rows at which jaxlib 0.10.2 is wrong: `xla_flags`; at 10,000 it is right
 jax_cache.install()
 
 

@@ -22,7 +22,7 @@ PACKAGE = ROOT / "jaxprt"
 PAGE = (ROOT / "docs" / "architecture.md").read_text()
 
 # From the top. A module may import from rooms further down.
-ROOMS = ["__main__", "cli", "view", "inverse", "relit", "systems", "image", "visibility", "scene", "brdf"]
+ROOMS = ["__main__", "public", "cli", "view", "inverse", "relit", "systems", "image", "visibility", "scene", "brdf"]
 ROOMS += ["decompose", "sphere", "files", "compile", "programs", "require"]
 
 # The ladder of systems, from the top: each builds on those of lower rungs, and on none of its own.
@@ -158,6 +158,8 @@ def test_decompositions_and_the_sphere_know_no_brdf_and_no_scene():
 
 def test_jax_is_not_configured():
     for module, text in TEXTS.items():
+        if module == "jaxprt.programs.xla_flags":  # avoids wrong sums of jaxlib 0.10.2
+            continue
         if module.startswith("jaxprt.programs."):  # reads all options; the one that it sets is a default of the user's
             changed = re.findall(r"(?:config\.update|environ\S*\]\s*=[^=]).*", text)
             assert all(line.startswith("config.update(_THRESHOLD, ") for line in changed), changed
@@ -166,8 +168,7 @@ def test_jax_is_not_configured():
         configured = {name for name in names if re.match(r"jax\.(config|enable_x64|experimental\.enable_x64)\b", name)}
         assert not configured, module
         assert not re.search(r"from jax(\.\w+)* import .*\b(config|enable_x64)\b", text), module
-        if module != "jaxprt.compile":  # which avoids wrong sums of jaxlib 0.10.2
-            assert not re.search(r"environ\S*[\"'](JAX|XLA)_", text), module
+        assert not re.search(r"environ\S*[\"'](JAX|XLA)_", text), module
 
 
 def test_what_is_compiled_states_the_precision_of_its_products():

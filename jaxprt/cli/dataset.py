@@ -43,7 +43,6 @@ _MEMORY = 1 << 28  # bytes of pictures that are held at once
 
 @options.command(
     "dataset",
-    "Render pictures of many scenes under many lights, for training.",
     options.FILES,
     Scene=options.SCENE,
     Light=[

@@ -22,7 +22,6 @@ _KINDS = {".html": "page", ".glb": "baked", ".json": "probes"}
 
 @options.command(
     "export",
-    "Export web pages, baked glTF, and light probes.",
     options.FILES,
     Scene=options.SCENE,
     Light=options.LIGHT,

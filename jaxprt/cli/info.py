@@ -39,7 +39,6 @@ _NAMES = 6  # most names of a file's materials that the text lists
 
 @options.command(
     "info",
-    "Describe meshes, scenes, environments, BRDFs and stores.",
     click.Argument(["files"], metavar="PATH...", type=click.Path(exists=True, path_type=Path), nargs=-1),
     Light=[{"light_size": (options.Range(1, 1024), inputs.LIGHT_SIZE)}],
     Scene=options.options_of(load_scene, outside=bool),

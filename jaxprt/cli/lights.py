@@ -25,7 +25,6 @@ _LINE = 28  # pixels below each picture for the name of its light
 
 @options.command(
     "lights",
-    "Draw a scene in many lights, on one sheet.",
     options.FILES,
     Scene=options.SCENE,
     Light=options.LIGHT,

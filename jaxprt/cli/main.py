@@ -1,21 +1,29 @@
 """The command line: `jaxprt`, and `python -m jaxprt`."""
 
+import importlib
 import os
 import sys
 import threading
 import warnings
-from types import SimpleNamespace
 from typing import Any
 
 import click
 import tqdm
-from click.shell_completion import get_completion_class
 
 import jaxprt
-from jaxprt.cli import dataset, export, info, inputs, lights, measure, options, planned, play, relight
-from jaxprt.relit import registry
 
 _INTERRUPTED = 130
+COMMANDS = {  # their modules, and what `jaxprt --help` says of them
+    "relight": ("relight", "Render a scene under lights, and measure errors."),
+    "lights": ("lights", "Draw a scene in many lights, on one sheet."),
+    "view": ("play", "Show a scene in the interactive viewer in a browser."),
+    "plan": ("planned", "Find the smallest system that meets an error."),
+    "measure": ("measure", "Measure errors, times and sizes of a scene or of a BRDF's fit."),
+    "export": ("export", "Export web pages, baked glTF, and light probes."),
+    "dataset": ("dataset", "Render pictures of many scenes under many lights, for training."),
+    "info": ("info", "Describe meshes, scenes, environments, BRDFs and stores."),
+    "completion": ("completion", "Print the script for completion in bash, zsh or fish."),
+}
 
 
 class Refused(click.ClickException):
@@ -29,7 +37,17 @@ class Program(click.Group):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """The commands in the order in which they are usually used."""
-        return list(self.commands)
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """A command, whose module is imported now."""
+        known = cmd_name in COMMANDS
+        return importlib.import_module(f"jaxprt.cli.{COMMANDS[cmd_name][0]}").command if known else None
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Writes the list of commands without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, words) for name, (_, words) in COMMANDS.items()])
 
     def invoke(self, ctx: click.Context) -> Any:
         """Runs a command."""
@@ -42,25 +60,28 @@ class Program(click.Group):
             click.echo("jaxprt: stopped; the same command goes on from here", err=True)
             ctx.exit(_INTERRUPTED)
         except (ValueError, TypeError, FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
-            raise Refused(options.message_of(error)) from error
+            raise Refused(_message_of(error)) from error
         except (OSError, RuntimeError, MemoryError) as error:
-            raise click.ClickException(options.message_of(error)) from error
+            raise click.ClickException(_message_of(error)) from error
 
 
-_EPILOG = f"""\b
+def _message_of(error: Exception) -> str:
+    """The message for users; imported where a command has failed and has imported it itself."""
+    return importlib.import_module("jaxprt.cli.options").message_of(error)
+
+
+_EPILOG = """\b
 Materials, for --brdf and --material:
-  models      {", ".join(list(registry.MATERIALS)[:7])},
-              {", ".join(list(registry.MATERIALS)[7:])}
+  models      lambert, phong, blinn-phong, ashikhmin-shirley, ward, ward-duer, cook-torrance,
+              lafortune, poulin-fournier, poulin-fournier-grooves, ggx, ggx-interface, charlie, metallic-roughness
   numbers     ward:diffuse=.1/.05/.02,specular=.3,along=.1,across=.3   colors have slashes
-  files       {", ".join(map(inputs.form, inputs.FILES))}
+  files       merl:FILE, npf:FILE,material=..[,names=..], lafortune:FILE,material=.., ngan:FILE,material=..,
+              scattered:FILE[,smoothing=..]
 """
 
 
 @click.group(
-    cls=Program,
-    commands=[module.command for module in (relight, lights, play, planned, measure, export, dataset, info)],
-    epilog=_EPILOG,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    cls=Program, epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110}
 )
 @click.version_option(jaxprt.__version__, "-V", "--version", prog_name="jaxprt")
 def program() -> None:
@@ -71,28 +92,6 @@ def program() -> None:
 
     Exit status: 0 for success, 1 for failures, 2 for wrong input, 130 after Ctrl-C.
     """
-
-
-@options.command(
-    "completion",
-    "Print the script for completion in bash, zsh or fish.",
-    click.Argument(["shell"], type=click.Choice(("bash", "zsh", "fish"))),
-)
-def completion(chosen: SimpleNamespace) -> None:
-    """Print the script with which a shell completes commands, options, materials and files.
-
-    \b
-    Examples:
-      jaxprt completion bash >> ~/.bashrc
-      jaxprt completion zsh >> ~/.zshrc
-      jaxprt completion fish > ~/.config/fish/completions/jaxprt.fish
-    """  # noqa: D301
-    kind = get_completion_class(chosen.shell)
-    if kind is not None:
-        click.echo(kind(program, {}, "jaxprt", "_JAXPRT_COMPLETE").source())
-
-
-program.add_command(completion)
 
 
 def run() -> None:

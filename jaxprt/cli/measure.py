@@ -18,7 +18,6 @@ _VERTICES = 300
 
 @options.command(
     "measure",
-    "Measure errors, times and sizes of a scene or of a BRDF's fit.",
     options.FILES,
     Scene=options.SCENE,
     Light=options.LIGHT,

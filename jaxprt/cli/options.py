@@ -56,14 +56,11 @@ class Command(click.Command):
                 formatter.write_dl([record for member in members if member and (record := member.get_help_record(ctx))])
 
 
-def command(
-    name: str, short_help: str, *arguments: click.Argument, **groups: list[Any]
-) -> Callable[[Callable], Command]:
+def command(name: str, *arguments: click.Argument, **groups: list[Any]) -> Callable[[Callable], Command]:
     """A decorator that makes a command of a function from options to a result, which the command prints.
 
     Args:
         name: The word that users type after `jaxprt`.
-        short_help: Sentence that `jaxprt --help` prints beside the word.
         arguments: Arguments that users give by position.
         groups: Options by the title of their section in the help. A dictionary in the list maps names of options to
             their types and defaults; the function's docstring describes these options.
@@ -88,7 +85,7 @@ def command(
             ]
         text, _, _ = (inspect.getdoc(function) or "").partition("\n\nOptions:\n")
         parameters = [*arguments, *itertools.chain(*members.values())]
-        result = Command(name, callback=run, params=parameters, help=text, short_help=short_help)
+        result = Command(name, callback=run, params=parameters, help=text)
         result.groups = members
         return result
 

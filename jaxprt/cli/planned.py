@@ -15,7 +15,6 @@ _RATE = options.Range(0.0, kind=float, open=True, name="FPS")
 
 @options.command(
     "plan",
-    "Find the smallest system that meets an error.",
     options.FILES,
     Scene=options.SCENE,
     Light=options.LIGHT,

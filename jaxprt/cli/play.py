@@ -41,7 +41,6 @@ _REFLECTION = (("response", 0.1), ("patches", 0.2), ("bounce", 0.3))
 
 @options.command(
     "view",
-    "Show a scene in the interactive viewer in a browser.",
     options.FILES,
     Scene=options.SCENE,
     Light=options.LIGHT,

@@ -40,7 +40,6 @@ class Shard(click.ParamType):
 
 @options.command(
     "relight",
-    "Render a scene under lights, and measure errors.",
     options.FILES,
     Scene=options.SCENE,
     Light=options.LIGHT,

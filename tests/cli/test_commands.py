@@ -16,7 +16,8 @@ import pytest
 import jaxprt as prt
 from jaxprt.cli import inputs, options, planned
 from jaxprt.cli import report as cli_report
-from jaxprt.cli.main import program
+from jaxprt.cli.main import COMMANDS, program
+from jaxprt.relit import registry
 
 
 def test_a_plan_is_printed_and_kept_and_relights(main, place, tmp_path, monkeypatch, capsys):
@@ -210,7 +211,8 @@ def test_shells_complete_commands_options_systems_and_materials(words, expected,
 
 
 def test_every_command_and_option_says_what_it_does():
-    for name, command in program.commands.items():
+    for name in COMMANDS:
+        command = program.get_command(click.Context(program), name)
         assert name == "completion" or f"\n  jaxprt {name} " in inspect.cleandoc(command.help)
         for option in command.params:
             assert not isinstance(option, click.Option) or option.help, (name, option.name)
@@ -225,6 +227,16 @@ def test_options_have_the_defaults_and_words_of_what_commands_call(main, capsys)
     assert "--size N Width and height of the pictures in pixels. [from 1 to 8192] [default: 512]" in help
     assert main("view", "--help") == 0
     assert "[default: lobe 8, dynamic 12]" in " ".join(capsys.readouterr().out.split())
+
+
+def test_the_help_names_all_materials_and_files_without_importing_jax():
+    script = "import sys; from jaxprt.cli.main import program\ntry: program(['--help'])\n"
+    script += "finally: assert 'jax' not in sys.modules"
+    help = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert "view        Show a scene in the interactive viewer in a browser.\n" in help
+    words = " ".join(help.split())
+    assert f"models {', '.join(registry.MATERIALS)} numbers" in words
+    assert words.endswith(", ".join(map(inputs.form, inputs.FILES)))
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
