@@ -173,7 +173,11 @@ def _always(_: Array) -> Array:
 
 
 def total(
-    term: Callable[[PyTree], Array], rows: PyTree, *, counts: Callable[[PyTree], Bool[Array, ""]] | None = None
+    term: Callable[[PyTree], Array],
+    rows: PyTree,
+    *,
+    counts: Callable[[PyTree], Bool[Array, ""]] | None = None,
+    together: int = 1,
 ) -> Array:
     """Sums a function over rows: on CPUs one row after another, elsewhere as many rows at once as memory permits.
 
@@ -182,12 +186,13 @@ def total(
         rows: Arrays with the rows along the first axis.
         counts: Whether any of `TOGETHER` rows counts, of which there must be a multiple. CPUs skip those of which none
             does, whose terms must be zero. A branch for each row would take longer than many terms.
+        together: Rows that CPUs add in one pass over the result, where terms are so simple that passes take the time.
     """
     shape = jax.eval_shape(term, _first(rows))
     start = jnp.zeros(shape.shape, shape.dtype)
 
     def added(carry, rows):
-        return jax.lax.scan(lambda carry, row: (carry + term(row), None), carry, rows)[0]
+        return jax.lax.scan(lambda carry, row: (carry + term(row), None), carry, rows, unroll=together)[0]
 
     def by_row(rows):
         if counts is None:

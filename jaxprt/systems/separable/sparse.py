@@ -154,7 +154,7 @@ def _accumulate(index: Shaped[Array, "k n"], value: Float[Array, "k n l"], table
         read = table.at[number.astype(jnp.int32)].get(mode="promise_in_bounds")
         return (weight[:, None] if gray else weight) * read
 
-    return total(term, (index, value))
+    return total(term, (index, value), together=4)
 
 
 @partial(jit, static_argnames=("keep",))
