@@ -1,8 +1,9 @@
 """The names of `import jaxprt`. They are imported when the first of them is used."""
 
-from jaxprt import brdf, decompose, files, image, inverse, relit, scene, sphere, view, visibility
+from jaxprt import brdf, daylight, decompose, files, image, inverse, relit, scene, sensors, sphere, view, visibility
 from jaxprt.relit import RelitScene, plan, precompute, refine, register
 from jaxprt.scene import Camera, Environment, Part, Scene, load_environment, load_mesh, load_scene
+from jaxprt.sensors import transport
 from jaxprt.systems import bounces, bright_texels, dynamic, harmonic, lamps, lobe, reference, separable
 from jaxprt.systems.devices import shard
 from jaxprt.systems.protocol import Blend, System, memory, radiance, total
@@ -20,6 +21,7 @@ __all__ = [
     "bounces",
     "brdf",
     "bright_texels",
+    "daylight",
     "decompose",
     "dynamic",
     "files",
@@ -40,10 +42,12 @@ __all__ = [
     "register",
     "relit",
     "scene",
+    "sensors",
     "separable",
     "shard",
     "sphere",
     "total",
+    "transport",
     "view",
     "visibility",
 ]

@@ -22,7 +22,21 @@ PACKAGE = ROOT / "jaxprt"
 PAGE = (ROOT / "docs" / "architecture.md").read_text()
 
 # From the top. A module may import from rooms further down.
-ROOMS = ["__main__", "public", "cli", "view", "inverse", "relit", "systems", "image", "visibility", "scene", "brdf"]
+ROOMS = [
+    "__main__",
+    "public",
+    "cli",
+    "view",
+    "inverse",
+    "daylight",
+    "sensors",
+    "relit",
+    "systems",
+    "image",
+    "visibility",
+    "scene",
+    "brdf",
+]
 ROOMS += ["decompose", "sphere", "files", "compile", "programs", "require"]
 
 # The ladder of systems, from the top: each builds on those of lower rungs, and on none of its own.

@@ -4,6 +4,7 @@ Everything here runs in NumPy on the host and returns arrays, so tests of other 
 construct themselves.
 """
 
+import functools
 import math
 import warnings
 from collections.abc import Mapping
@@ -97,6 +98,7 @@ def fractional(
     *,
     size: int,
     supersample: bool | Bool[np.ndarray, "v d"] = True,
+    spread: bool = False,
 ) -> tuple[UInt8[np.ndarray, "v d"], RayCount]:
     """Visible fraction of each cubemap texel from each point, in sixteenths; 0 below the horizon.
 
@@ -111,6 +113,8 @@ def fractional(
         normal: Unit normals.
         size: Edge of the cubemap's faces in texels.
         supersample: Whether texels on a visibility boundary are supersampled: all, none, or some for each point.
+        spread: Whether the first ray goes through another place of each texel, and its neighbors alone decide if more
+            do. Sums over many texels are then unbiased, where slits are narrower than texels.
 
     Returns:
         Visibility times 16 of the 6 size^2 texels, and the number of rays.
@@ -124,7 +128,7 @@ def fractional(
     for first in range(0, len(start), step):
         part = slice(first, first + step)
         fine = supersample if isinstance(supersample, bool) else supersample[part]
-        count += _trace(occluder, start[part], above[part], seen[part], table, fine)
+        count += _trace(occluder, start[part], above[part], seen[part], table, fine, first if spread else None)
     return seen, count
 
 
@@ -297,15 +301,18 @@ def _trace(
     seen: np.ndarray,
     table: _Tables,
     supersample: bool | np.ndarray,
+    spread: int | None,
 ) -> RayCount:
-    """Fills `seen` for some of the points."""
+    """Fills `seen` for some of the points; `spread` is the index of the first one, None for rays through middles."""
     vertex, rank = np.nonzero(above.take(table.order, axis=1))
     texel = table.order.take(rank)
     flat, index = seen.reshape(-1), vertex * above.shape[1] + texel
-    flat[index] = _dither(LEVELS * _shares(occluder, start, table.center, vertex, texel), vertex, texel)
+    ways = (table.center, texel) if spread is None else (table.fine, _places(vertex + spread, texel))
+    flat[index] = _dither(LEVELS * shares(occluder, start, ways[0], vertex, ways[1]), vertex, texel)
     mixed = index[:0]
     if supersample is not False:
-        mixed = np.flatnonzero((_varies(seen, table.border) & supersample).reshape(-1)[index])
+        varies = _varies if spread is None else _varies_around
+        mixed = np.flatnonzero((varies(seen, table.border) & supersample).reshape(-1)[index])
         flat[index[mixed]] = _supersample(occluder, start, vertex[mixed], texel[mixed], table)
     return RayCount(len(index) + LEVELS * len(mixed), len(index), len(mixed))
 
@@ -324,7 +331,7 @@ def _finer(
     return wide.reshape(len(coarse), -1) * _above_horizon(normal, size)
 
 
-def _shares(occluder: Occluder, *rays: np.ndarray) -> UInt8[np.ndarray, " n"] | Float32[np.ndarray, " n"]:
+def shares(occluder: Occluder, *rays: np.ndarray) -> UInt8[np.ndarray, " n"] | Float32[np.ndarray, " n"]:
     """Share of light that passes along each ray; whole numbers for an occluder that does not blend."""
     return occluder.passed(*rays) if occluder.blends else (~occluder.blocked(*rays)).view(np.uint8)
 
@@ -342,6 +349,26 @@ def _varies(seen: UInt8[np.ndarray, "v d"], border: np.ndarray) -> Bool[np.ndarr
     return (_around(np.maximum, padded) - _around(np.minimum, padded) > LEVELS // 8).reshape(seen.shape)
 
 
+def _varies_around(seen: UInt8[np.ndarray, "v d"], border: np.ndarray) -> Bool[np.ndarray, "v d"]:
+    """The same of the eight neighbors, without the texel itself."""
+    padded = seen.take(border.reshape(-1), axis=1).reshape(-1, *border.shape)
+    edge = padded.shape[-1] - 2
+    around = [
+        padded[..., row : row + edge, column : column + edge]
+        for row, column in np.ndindex(3, 3)
+        if (row, column) != (1, 1)
+    ]
+    most, least = (functools.reduce(extreme, around) for extreme in (np.maximum, np.minimum))
+    return (most - least > LEVELS // 8).reshape(seen.shape)
+
+
+def _places(vertex: np.ndarray, texel: np.ndarray) -> np.ndarray:
+    """Indices of directions within texels, by a hash of both."""
+    mixed = (vertex.astype(np.uint32) * np.uint32(2654435761)) ^ (texel.astype(np.uint32) * np.uint32(2246822519))
+    mixed = (mixed ^ (mixed >> 15)) * np.uint32(3266489917)
+    return LEVELS * texel + (mixed >> np.uint32(28)).astype(texel.dtype)
+
+
 def _around(extreme: np.ufunc, padded: np.ndarray) -> np.ndarray:
     """Maximum or minimum over 3 x 3 neighborhoods of images with a border of one texel."""
     rows = extreme(extreme(padded[..., :-2, :], padded[..., 1:-1, :]), padded[..., 2:, :])
@@ -355,7 +382,7 @@ def _supersample(occluder, start, vertex, texel, table) -> np.ndarray:
     for first in range(0, len(vertex), step):
         part = slice(first, first + step)
         way = (LEVELS * texel[part, None] + np.arange(LEVELS)).reshape(-1)
-        share = _shares(occluder, start, table.fine, np.repeat(vertex[part], LEVELS), way).reshape(-1, LEVELS)
+        share = shares(occluder, start, table.fine, np.repeat(vertex[part], LEVELS), way).reshape(-1, LEVELS)
         out[part] = _dither(share.sum(1, dtype=share.dtype), vertex[part], texel[part])
     return out
 
