@@ -65,7 +65,7 @@ REASONS = {
     """,
     "takes functions": "compile brdf.microfacet.values",
     "reads or writes files, or runs workers": """
-        programs cli brdf.fitted view files visibility.blocks systems.separable.clustered.precompute
+        programs cli daylight brdf.fitted view files visibility.blocks systems.separable.clustered.precompute
         systems.harmonic.exchange brdf.scattered brdf.measured.load_merl brdf.measured.load_npf
         brdf.navigation.cook_torrance systems.dynamic.transport.compress scene.mesh scene.formats
         scene.environment.load_environment scene.environment.layout_of
@@ -87,6 +87,7 @@ REASONS = {
         systems.harmonic.exported systems.lobe.exported scene.environment.sky
     """,
     "traces rays": """
+        sensors
         relit visibility.picture_rays image.pixels.visible_points image.pixels.coverage image.pixels.nearest_fragments
         visibility.rays visibility.occluder visibility.embree visibility.picture_loops visibility.refinement
         systems.separable.sparse.precompute benchmarks.published.interreflection visibility.stored.precompute
@@ -108,7 +109,7 @@ REASONS = {
         scene.texture.tilt_normals scene.texture.normal_variance scene.texture.widen_roughness
     """,
     "a NumPy table, or an index in one": """
-        sphere.hats.centers sphere.hats.table sphere.hats.inverse_gram systems.lobe.pyramid.scales
+        sphere.patches sphere.hats.centers sphere.hats.table sphere.hats.inverse_gram systems.lobe.pyramid.scales
         systems.lobe.pyramid.between systems.lobe.pyramid.corners systems.lobe.blurred_light.scales
         systems.lobe.blurred_light.finer_scales systems.lobe.pyramid.of_scale
         visibility.members.places sphere.cubemap.axes brdf.measured.cell_angles brdf.measured.lower_cosine

@@ -13,7 +13,7 @@ from sphinx.application import Sphinx
 import jaxprt
 
 # Users reach these by the command `python -m jaxprt`, or not at all.
-_HIDDEN = {"jaxprt.__main__", "jaxprt.cli", "jaxprt.compile", "jaxprt.require"}
+_HIDDEN = {"jaxprt.__main__", "jaxprt.cli", "jaxprt.public", "jaxprt.compile", "jaxprt.require"}
 _CODE = re.compile(r"(``.+?``|`[^`]+`)")
 _SPECIAL = re.compile(r"[*|]|_(?=\W|$)")
 

@@ -21,6 +21,8 @@ COMMANDS = {  # their modules, and what `jaxprt --help` says of them
     "measure": ("measure", "Measure errors, times and sizes of a scene or of a BRDF's fit."),
     "export": ("export", "Export web pages, baked glTF, and light probes."),
     "dataset": ("dataset", "Render pictures of many scenes under many lights, for training."),
+    "daylight": ("daylight", "What sensors of a building receive in a year."),
+    "splats": ("splats", "Relight a cloud of Gaussian splats."),
     "info": ("info", "Describe meshes, scenes, environments, BRDFs and stores."),
     "completion": ("completion", "Print the script for completion in bash, zsh or fish."),
 }

@@ -164,7 +164,9 @@ def year(
     factor = 100 * np.asarray(received.apply(overcast)) / _horizontal(overcast, subdivision)
 
     def of_block(part: slice) -> tuple[np.ndarray, ...]:
-        return _summed(np.array(_irradiance(received.rows(part), *light)), _by_sun(job, sun, part), sun, occupied, hours)
+        return _summed(
+            np.array(_irradiance(received.rows(part), *light)), _by_sun(job, sun, part), sun, occupied, hours
+        )
 
     starts = range(0, job.vertices, _BLOCK)
     slices = [slice(first, min(first + _BLOCK, job.vertices)) for first in starts]
@@ -233,8 +235,7 @@ def _overcast(subdivision: int, ground: float) -> Float[np.ndarray, " p"]:
 
 def _horizontal(sky: Float[np.ndarray, " p"], subdivision: int) -> float:
     """Irradiance of the open ground."""
-    up = np.maximum(patches.centers(subdivision=subdivision)[:, 1], 0)
-    return float(np.sum(sky * up * patches.solid_angles(subdivision=subdivision)))
+    return float(np.sum((sky * patches.projected_solid_angles(subdivision=subdivision))[1:]))
 
 
 @jit

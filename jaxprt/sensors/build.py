@@ -20,14 +20,13 @@ from jaxprt.compile import jit
 from jaxprt.files.arrays import Header, Layout, sketch
 from jaxprt.relit import refinement
 from jaxprt.scene import Part, Scene, TexturedMaterial, material_table
-from jaxprt.scene import origin as origins
 from jaxprt.scene.mesh import Mesh, frames
 from jaxprt.scene.scene import centered
 from jaxprt.sensors.bases import Basis, Patches
 from jaxprt.sensors.matrix import PointTransport
 from jaxprt.sphere import cubemap, directions
 from jaxprt.visibility import Run, blocks, rays
-from jaxprt.visibility.blocks import Progress
+from jaxprt.visibility.blocks import Progress, Shard
 from jaxprt.visibility.occluder import Occluder, offsets
 from jaxprt.visibility.rays import LEVELS
 from jaxprt.visibility.starts import start_points
@@ -46,7 +45,7 @@ _SIZES = 32, 64, 128, 256, 512
 def transport(
     scene: Scene,
     points: Float[np.ndarray, "p 3"],
-    normals: Float[np.ndarray, "p 3"] | None = None,
+    normals: Float[np.ndarray, "p 3"] | None,
     *,
     basis: Basis = _SKY,
     kind: str = "irradiance",
@@ -96,7 +95,8 @@ def transport(
     run = Run(path, executor, progress)
     job, reached = _sized(job, error)
     if bounces:
-        job = _with_reflections(job, solid, bounces, run)
+        # Each part of a job array computes what all of them need: they would wait for each other three times.
+        job = _with_reflections(job, solid, bounces, Run(progress=progress) if isinstance(executor, Shard) else run)
     result = blocks.compute(job, run.within("points"), label="points")
     parts = [_matrix(result[name], job) for name in ("direct", "reflected") if name in result]
     dark = np.flatnonzero(~np.any([np.asarray(part).any(tuple(range(1, part.ndim))) for part in parts], 0))
@@ -126,7 +126,7 @@ def prepared(
     origin = scene.parts[0].mesh.origin
     solid, panes = _apart(centered(scene), {} if glass is None else glass)
     require.finite("the points", points)
-    place = np.asarray(origins.local("the points", np.asarray(points, np.float64), origin), np.float32)
+    place = (np.asarray(points, np.float64) - np.asarray(origin)).astype(np.float32)
     out = _normals(normals, place, required=kind != "scalar" or brdf is not None)
     more: dict[str, Any] = {"panes": panes, "size": size, "basis": basis, "kind": kind, "brdf": brdf}
     more["view"] = None if view is None else _directions("the views", view, len(place))

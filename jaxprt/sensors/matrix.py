@@ -71,15 +71,15 @@ class PointTransport(eqx.Module):
     """
 
     direct: Shaped[Array, "p b *c"] | Sparse | Quantized
-    reflected: Float[Array, "p b *c"] | None
+    reflected: Float[Array, "p b *d"] | None
     basis: Basis
     error: float = eqx.field(static=True, default=0.0)
     dark: tuple[int, ...] = eqx.field(static=True, default=())
 
     @property
-    def matrix(self) -> Float[Array, "p b *c"]:
+    def matrix(self) -> Float[Array, "p b *e"]:
         """Direct and reflected light together, as one matrix."""
-        if not isinstance(self.direct, Array):
+        if isinstance(self.direct, Sparse | Quantized):
             raise TypeError("a compressed transport has no matrix: use apply, or the transport it was made of")
         if self.reflected is None:
             return self.direct

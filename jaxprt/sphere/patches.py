@@ -13,7 +13,6 @@ Standard daylight coefficient model for dynamic daylighting simulations.
 import numpy as np
 from jaxtyping import Float, Int
 
-
 MOST = 6  # the finest subdivision
 _TREGENZA = np.array([30, 30, 24, 24, 18, 12, 6])  # patches per row, from the horizon up
 
