@@ -29,7 +29,9 @@ _UP = ("x", "y", "z", "-x", "-y", "-z")
         {"captured": (_FILE,), "up": (click.Choice(_UP), "y")},
         {"stops": (options.Range(-100.0, 100.0, kind=float, name="N|auto", auto=None),)},
     ],
-    Transport=[{"degree": (options.Range(0, 14), 2), "bounces": (options.Range(0), 0)}],
+    Transport=[
+        {"degree": (options.Range(0, 14), 2), "bounces": (options.Range(0), 0), "rays": (options.Range(2, 64), 8)}
+    ],
     Output=[
         click.Option(
             ["--output", "-o"],
@@ -63,6 +65,7 @@ def command(chosen: SimpleNamespace) -> options.Result:
         stops: Exposure of the colors in stops.  [default: auto, from their 99th percentile]
         degree: Largest degree of the spherical harmonics of light.
         bounces: How often the proxy reflects light before it arrives.
+        rays: Texels along the edge of a cube through whose middles rays go from each splat.
         store: Folder that keeps precomputed data for later runs.
     """  # noqa: D301
     path = outputs.target(chosen.output, ".ply")
@@ -75,7 +78,7 @@ def command(chosen: SimpleNamespace) -> options.Result:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".* get no light")  # the result counts them
         transport = clouds.splat_transport(
-            splats, proxy, degree=chosen.degree, bounces=chosen.bounces, **options_of_run
+            splats, proxy, degree=chosen.degree, bounces=chosen.bounces, size=chosen.rays, **options_of_run
         )
     albedo = clouds.albedo_guess(splats, transport, captured)
     clouds.write_splats(path, clouds.relit(splats, transport, albedo, light, stops=chosen.stops))

@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from jaxprt.brdf import Lambert
-from jaxprt.daylight import Weather, false_colors, load_rad, sun_directions, year
+from jaxprt.daylight import Weather, false_colors, load_rad, picture_matrix, sky_matrix, sun_directions, year
+from jaxprt.daylight.pictures import lights
 from jaxprt.daylight.sky import EFFICACY
 from jaxprt.daylight.year import SUN_RADIUS
-from jaxprt.scene import Part, Scene
+from jaxprt.relit import precompute
+from jaxprt.scene import Environment, Part, Scene, builtin
+from jaxprt.scene.camera import orbit
 from jaxprt.scene.mesh import make_mesh
 
 UP = np.array([[0.0, 1.0, 0.0]])
@@ -109,6 +112,16 @@ def test_a_picture_shows_the_largest_value_in_the_last_color():
     for color in false_colors.scale(np.array([0.0, 1.0])):
         assert np.mean(np.all(np.abs(image[:480] - color) < 0.02, -1)) > 0.01
     assert np.all((image >= 0) & (image <= 1))
+
+
+def test_pictures_of_hours_are_sums_of_those_of_patches():
+    ball = Scene([Part("ball", builtin.sphere(rings=6, sectors=8), Lambert([0.5] * 3))])
+    relit = precompute(ball, system="harmonic", size=8, refine=False, progress=False)
+    camera = orbit(relit.mesh, elevation=0.3, width=12, height=12)
+    matrix = picture_matrix(relit, camera, samples=1)
+    hours = sky_matrix(weather(0.0, 100.0, days=(80,)))[:, 12]
+    light = Environment(sum(weight * row.radiance for weight, row in zip(hours, lights(1, size=64), strict=True)))
+    np.testing.assert_allclose(np.tensordot(hours, matrix, 1), relit.picture(light, camera, samples=1), rtol=2e-3)
 
 
 def test_bad_input_is_refused():
