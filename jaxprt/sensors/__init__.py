@@ -2,6 +2,7 @@
 
 from jaxprt.sensors.bases import Harmonics, Patches, Texels
 from jaxprt.sensors.build import transport
+from jaxprt.sensors.lightmaps import Lightmap, lightmap
 from jaxprt.sensors.matrix import PointTransport
 
-__all__ = ["Harmonics", "Patches", "PointTransport", "Texels", "transport"]
+__all__ = ["Harmonics", "Lightmap", "Patches", "PointTransport", "Texels", "lightmap", "transport"]

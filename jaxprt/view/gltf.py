@@ -170,6 +170,26 @@ def export_gltf(
     outputs.write(path, file.content({"prt": prt}, "with transfer in the attributes _PRT_0 and following"))
 
 
+def write_lightmap(path: str | os.PathLike, part: Part, image: Float[np.ndarray, "n n 3"]) -> None:
+    """Writes a part whose radiance any viewer shows as it is: black, with an emissive texture.
+
+    Args:
+        path: The file, *.glb.
+        part: The part that `jaxprt.sensors.lightmap` was made of.
+        image: Linear radiance, from `Lightmap.image`; values above 1 are white.
+    """
+    path, file, mesh = outputs.target(path, ".glb"), _File(), part.mesh
+    place = np.asarray(mesh.texture if part.second is None else part.second) * [1, -1] + [0, 1]
+    attributes = {"POSITION": file.positions(mesh.position), "NORMAL": file.array(mesh.normal, "<f4")}
+    attributes["TEXCOORD_0"] = file.array(place, "<f4")
+    shown = np.asarray(encode_srgb(jnp.clip(jnp.asarray(image), 0, 1)))
+    black = {"baseColorFactor": [0, 0, 0, 1], "metallicFactor": 0, "roughnessFactor": 1}
+    texture = {"index": file.texture(shown, ("clamp", "clamp"))}
+    material = {"pbrMetallicRoughness": black, "emissiveFactor": [1, 1, 1], "emissiveTexture": texture}
+    _add_node(file, part, part.name, attributes, file.add("materials", material | {"name": part.name}))
+    outputs.write(path, file.content({}, "lightmap"))
+
+
 def _light(light: Environment, degree: int) -> Float[np.ndarray, "lm 3"]:
     coefficient = np.asarray(harmonics.project(jnp.asarray(light.radiance), degree=degree), np.float64)
     return np.broadcast_to(coefficient, (len(coefficient), 3))
