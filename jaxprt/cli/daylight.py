@@ -9,13 +9,14 @@ import click
 import numpy as np
 
 from jaxprt import files
-from jaxprt.cli import options
+from jaxprt.cli import inputs, options
 from jaxprt.daylight import false_colors
 from jaxprt.daylight import files as buildings
 from jaxprt.daylight.weather import load_weather
 from jaxprt.daylight.year import Year, year
-from jaxprt.scene import Scene, load_scene
+from jaxprt.scene import Scene
 from jaxprt.visibility import Shard, UnfinishedError
+from jaxprt.visibility.blocks import fingerprint
 
 _WEATHER = (".epw", ".wea")
 _SENSORS = ".pts"
@@ -55,6 +56,7 @@ class _Glass(click.ParamType):
     "daylight",
     options.FILES,
     Building=[
+        *options.options_of(inputs.scene, up=click.Choice(list(inputs.UPRIGHT))),
         {"bounces": (options.Range(0), 2), "glass": (_Glass(), ())},
         {"ground": (options.Range(0.0, 1.0, kind=float, name="ALBEDO"), 0.2)},
     ],
@@ -84,16 +86,27 @@ def command(chosen: SimpleNamespace) -> options.Result:
         rays: Texels along the edge of a cube through whose middles rays go from each sensor.
         part: Part of a job array that shares the folder. The last one, or a call without a part, gives the results.
     """  # noqa: D301
-    scene, glass, grids, weather_file = _read(chosen.files)
+    scene, glass, grids, weather_file = _read(chosen.files, chosen.up)
     glass |= dict(chosen.glass)
     weather = load_weather(str(weather_file))
     options.make_folder(chosen.output)
-    size = float(np.linalg.norm(np.ptp(np.asarray(scene.mesh.position), 0)))
+    place = np.asarray(scene.mesh.position, np.float64) + np.asarray(scene.mesh.origin)
+    size = float(np.linalg.norm(np.ptp(place, 0)))
     if size > _LARGE:
         click.echo(f"Warning: the model is {size:.0f} meters large; are its units millimeters?", err=True)
     results = {}
     for name, (position, normal) in grids.items():
-        work = {"path": str(chosen.output / "work" / name), "executor": chosen.part, "progress": sys.stderr.isatty()}
+        off = np.any((position < place.min(0) - size) | (position > place.max(0) + size), 1).sum()
+        if off:
+            told = f"{off} of {len(position)} sensors of {name} are farther from the model than its size"
+            click.echo(f"Warning: {told}: do units, axes and coordinates agree?", err=True)
+        setting = np.array([chosen.bounces, chosen.subdivision, chosen.rays, *glass.values()])
+        key = fingerprint(position, normal, place, np.asarray(scene.mesh.face), setting)[:12]
+        work = {
+            "path": str(chosen.output / "work" / f"{name}-{key}"),
+            "executor": chosen.part,
+            "progress": sys.stderr.isatty(),
+        }
         known = {"bounces": chosen.bounces, "glass": glass, "ground": chosen.ground, "subdivision": chosen.subdivision}
         try:
             result = year(scene, position, normal, weather, size=chosen.rays, **known, **work)
@@ -119,10 +132,11 @@ def _summary(result: Year) -> dict[str, Any]:
         "UDI_100_3000": float(result.useful[:, 1].mean()),
         "daylight_factor_percent": float(result.factor.mean()),
         "radiation_kwh_m2": float(result.radiation.mean()),
+        "error": result.error,
     }
 
 
-def _read(paths: tuple[Path, ...]) -> tuple[Scene, dict[str, float], dict[str, Any], Path]:
+def _read(paths: tuple[Path, ...], up: str) -> tuple[Scene, dict[str, float], dict[str, Any], Path]:
     """The building, its glass, the sensors by grid, and the weather file."""
     kinds: dict[str, list[Path]] = {"weather": [], "sensors": [], "radiance": [], "folder": [], "model": []}
     for path in paths:
@@ -141,8 +155,9 @@ def _read(paths: tuple[Path, ...]) -> tuple[Scene, dict[str, float], dict[str, A
     elif kinds["radiance"]:
         scene, glass = buildings.load_rad(*map(str, kinds["radiance"]))
     else:
-        scene = load_scene(kinds["model"][0])
-    grids |= {path.stem: buildings.load_sensors(str(path)) for path in kinds["sensors"]}
+        scene = inputs.scene([kinds["model"][0]], up=up, refine=False)
+    names = inputs.unique([*grids, *(path.stem for path in kinds["sensors"])])[len(grids) :]
+    grids |= {name: buildings.load_sensors(str(path)) for name, path in zip(names, kinds["sensors"], strict=True)}
     if not grids:
         raise click.UsageError("daylight needs sensors: a .pts file with rows x y z nx ny nz, got none")
     return scene, glass, {name.replace("/", "_"): grid for name, grid in grids.items()}, kinds["weather"][0]

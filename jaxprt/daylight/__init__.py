@@ -1,5 +1,6 @@
 """Daylight of buildings over a year: weather files, skies, the sun, and what sensors receive."""
 
+from jaxprt.daylight import false_colors
 from jaxprt.daylight.files import load_honeybee, load_rad, load_sensors
 from jaxprt.daylight.pictures import picture_matrix
 from jaxprt.daylight.sky import cie_sky, sky_matrix
@@ -10,6 +11,7 @@ __all__ = [
     "Weather",
     "Year",
     "cie_sky",
+    "false_colors",
     "load_honeybee",
     "load_rad",
     "load_sensors",

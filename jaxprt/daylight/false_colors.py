@@ -45,17 +45,20 @@ def picture(
     Returns:
         A picture in display values.
     """
-    mesh, middle = scene.mesh, np.mean(position, 0)
+    mesh, zero = scene.mesh, np.mean(position, 0)
+    position = position - zero  # near zero, where single precision has triangles
     square = _squares(position, normal)
     if camera is None:
-        around = make_mesh(np.concatenate([_places(mesh), square.reshape(-1, 3)]), _both(mesh, len(position)))
+        around = make_mesh(np.concatenate([_places(mesh) - zero, square.reshape(-1, 3)]), _both(mesh, len(position)))
         camera = orbit(around, azimuth=0.5, elevation=0.9, width=640, height=480)
+    else:
+        camera = camera.local((float(zero[0]), float(zero[1]), float(zero[2])))
     most = float(np.max(value)) or 1.0
-    place, eye = _places(mesh), np.asarray(camera.eye, np.float64)
+    place, eye = _places(mesh) - zero, np.asarray(camera.eye, np.float64)
     face = np.asarray(mesh.face)
     a, b, c = (place[face[:, corner]] for corner in range(3))
     across = np.cross(b - a, c - a)
-    toward, inward = (np.sum(across * (goal - a), 1) for goal in (eye, middle))
+    toward, inward = (np.sum(across * (goal - a), 1) for goal in (eye, np.zeros(3)))
     shown = toward * inward >= 0
     face = np.where((toward < 0)[:, None], face[:, ::-1], face)[shown]
     lean = np.abs(across[shown, 1]) / np.maximum(np.linalg.norm(across[shown], axis=1), 1e-30)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Float32
 
 from jaxprt import require
 from jaxprt.compile import jit
-from jaxprt.daylight.sky import EFFICACY, cie_sky, sky_matrix
+from jaxprt.daylight.sky import EFFICACY, sky_matrix
 from jaxprt.daylight.weather import Weather, sun_directions
 from jaxprt.files import outputs
 from jaxprt.scene import Scene
@@ -26,7 +26,6 @@ SUN_RADIUS = np.deg2rad(0.2665)  # of the disk, in radians
 _PLACES = 16  # on the disk of the sun
 _RAYS = 4  # from each sensor to each position of the sun
 _BLOCK = 64  # sensors that a thread computes at a time
-_OVERCAST = 1  # the sky of a daylight factor: type 1 of CIE S 011
 ENOUGH, GLARE, USEFUL = 300.0, 1000.0, (100.0, 3000.0)  # lux
 AUTONOMOUS, EXPOSED = 0.5, 250.0  # share of the occupied hours of sDA, and hours of ASE
 
@@ -43,7 +42,9 @@ class Year:
         autonomy: Share of the occupied hours with at least 300 lx.
         useful: Shares of the occupied hours below 100 lx, from 100 to 3000 lx, and above: useful daylight illuminance.
         exposed: Occupied hours with at least 1000 lx of the sun alone, without reflected light.
-        factor: Daylight factor: illuminance under the overcast sky of CIE relative to that of the open ground, in %.
+        factor: Daylight factor: illuminance under the traditional overcast sky of CIE (that of `gensky -c`) relative to
+            that of the open ground, in %.
+        error: Relative L2 error of the matrix of the sky; see `jaxprt.sensors.PointTransport`.
         illuminance: Illuminance of each hour in lx; None unless it was asked for.
     """
 
@@ -55,6 +56,7 @@ class Year:
     useful: Float[np.ndarray, "p 3"]
     exposed: Float[np.ndarray, " p"]
     factor: Float[np.ndarray, " p"]
+    error: float
     illuminance: Float32[np.ndarray, "p h"] | None = None
 
     @property
@@ -174,7 +176,9 @@ def year(
         results = list(_tracked(pool.map(of_block, slices), len(slices), progress))
     radiation, mean, autonomy, useful, exposed, *each_hour = map(np.concatenate, zip(*results, strict=True))
     place = np.asarray(points, np.float64), job.frame[:, 2].astype(np.float64)
-    return Year(*place, radiation, mean, autonomy, useful, exposed, factor, each_hour[0] if hours else None)
+    return Year(
+        *place, radiation, mean, autonomy, useful, exposed, factor, received.error, each_hour[0] if hours else None
+    )
 
 
 def _tracked(results: Iterator, count: int, progress: Progress) -> Iterator:
@@ -227,8 +231,8 @@ class _Sun:
 
 
 def _overcast(subdivision: int, ground: float) -> Float[np.ndarray, " p"]:
-    """The overcast sky of CIE over a ground that it lights."""
-    sky = np.array(cie_sky(_OVERCAST, np.array([0.0, 1.0, 0.0]), subdivision=subdivision))
+    """The traditional overcast sky of CIE (Moon and Spencer 1942) over a ground that it lights."""
+    sky = (1 + 2 * patches.centers(subdivision=subdivision)[:, 1]) / 3
     sky[0] = ground / np.pi * _horizontal(sky, subdivision)
     return sky
 
