@@ -41,6 +41,7 @@ MOST_ERROR = {
     "compression": 1.0,
     "concave": 0.5,  # of all bounces against one alone
     "dataset": 0.6,
+    "daylight": 0.05,  # of a sixteenth of the rays
     "device": 0.0,  # Here it is the CPU itself.
     "endurance": 1e-3,  # of half floats
     "factorization": 1e-4,

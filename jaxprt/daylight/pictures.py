@@ -13,7 +13,7 @@ _SIZE = 64  # texels along an edge of the lights, where the scene takes any
 
 
 def picture_matrix(
-    relit: RelitScene, camera: Camera | None = None, *, subdivision: int = 1, samples: int = 4
+    relit: RelitScene, *, camera: Camera | None = None, subdivision: int = 1, samples: int = 4
 ) -> Float[np.ndarray, "b h w 3"]:
     """Pictures of a scene in the light of each patch of the sky alone, with radiance 1.
 

@@ -277,9 +277,7 @@ def _above(position: np.ndarray, nearest: Nearest, diagonal: float) -> Float[np.
     return np.where(below[:, None], nearest.point + _LIFT * diagonal * nearest.normal, position)
 
 
-def albedo_guess(
-    splats: Splats, transport: PointTransport, captured: Environment | None = None
-) -> Float32[np.ndarray, "n 3"]:
+def albedo_guess(splats: Splats, transport: PointTransport, captured: Environment | None) -> Float32[np.ndarray, "n 3"]:
     """Guesses the albedo of splats: their color over the radiance that a white surface would have in the same light.
 
     It is a guess, because colors of training pictures have an unknown exposure and tone curve, and hold highlights.

@@ -118,7 +118,7 @@ def test_pictures_of_hours_are_sums_of_those_of_patches():
     ball = Scene([Part("ball", builtin.sphere(rings=6, sectors=8), Lambert([0.5] * 3))])
     relit = precompute(ball, system="harmonic", size=8, refine=False, progress=False)
     camera = orbit(relit.mesh, elevation=0.3, width=12, height=12)
-    matrix = picture_matrix(relit, camera, samples=1)
+    matrix = picture_matrix(relit, camera=camera, samples=1)
     hours = sky_matrix(weather(0.0, 100.0, days=(80,)))[:, 12]
     light = Environment(sum(weight * row.radiance for weight, row in zip(hours, lights(1, size=64), strict=True)))
     np.testing.assert_allclose(np.tensordot(hours, matrix, 1), relit.picture(light, camera, samples=1), rtol=2e-3)

@@ -170,7 +170,7 @@ def test_relighting_by_the_captured_light_returns_its_colors(cloud, transport):
 
 
 def test_relit_splats_change_in_color_alone(cloud, transport):
-    lit = relit(cloud[0], transport, albedo_guess(cloud[0], transport), SUN)
+    lit = relit(cloud[0], transport, albedo_guess(cloud[0], transport, None), SUN)
     for name in FIELDS:
         if name.startswith("f_rest_"):
             assert not lit.record[name].any()
@@ -180,7 +180,7 @@ def test_relit_splats_change_in_color_alone(cloud, transport):
 
 
 def test_without_a_captured_light_the_brightest_albedo_is_that_of_paper(cloud, transport):
-    albedo = albedo_guess(cloud[0], transport)
+    albedo = albedo_guess(cloud[0], transport, None)
     assert np.percentile(albedo, 99) == pytest.approx(0.8, rel=1e-3)
     assert albedo.max() <= 1
 
