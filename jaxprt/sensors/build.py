@@ -36,6 +36,7 @@ _COARSE = 32  # texels along an edge for light that is reflected before it arriv
 _SAMPLE = 64  # points of which the error is measured
 _PANES = 8  # surfaces of glass that a ray passes at most
 _GLASS = 1.52  # index of refraction
+_CLEAREST = 1.09  # transmissivity of a pane that lets all light pass, as Radiance counts it
 _KINDS = ("irradiance", "scalar")
 _SKY = Patches()
 _SIZES = 32, 64, 128, 256, 512
@@ -170,7 +171,7 @@ def _apart(scene: Scene, glass: Mapping[str, float]) -> tuple[Scene, list[tuple[
     if unknown:
         raise ValueError(f"glass must name parts of the scene, got {unknown[0]!r}; parts are {', '.join(names)}")
     for name, share in glass.items():
-        require.number(f"the transmissivity of {name!r}", share, 0.0, high=1.0)
+        require.number(f"the transmissivity of {name!r}", share, 0.0, high=_CLEAREST)
     solid = [part for part in scene.parts if part.name not in glass]
     if not solid:
         raise ValueError("the scene must have parts that are not of glass, got none")
