@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Shaped, UInt8, UInt16
+from jaxtyping import Array, Float, UInt8, UInt16
 
 from jaxprt import require
 from jaxprt.compile import jit
@@ -70,7 +70,7 @@ class PointTransport(eqx.Module):
         dark: Points that no light reaches, such as those inside of solids.
     """
 
-    direct: Shaped[Array, "p b *c"] | Sparse | Quantized
+    direct: Float[Array, "p b *c"] | Sparse | Quantized
     reflected: Float[Array, "p b *d"] | None
     basis: Basis
     error: float = eqx.field(static=True, default=0.0)

@@ -26,6 +26,7 @@ import jaxprt as prt
 from jaxprt.brdf import navigation, varying
 from jaxprt.files import arrays, objects
 from jaxprt.scene import Camera, Environment, Part, Scene, Texture, TexturedMaterial, builtin
+from jaxprt.sensors.bases import Basis
 from jaxprt.sphere import hemisphere
 
 # Host records of the command line, of reports, of files that are read, and libraries; no user saves them.
@@ -99,6 +100,8 @@ def value(hint, random, name="", within=()):
         return plain[hint]
     if hint in (prt.System, prt.systems.protocol.VertexSystem):
         hint = prt.harmonic.DiffuseSystem  # Any system will do.
+    if hint is Basis:
+        hint = prt.sensors.Patches
     if hint is prt.systems.standard.StandardTable:
         return prt.systems.standard.METALLIC_ROUGHNESS
     if inspect.isclass(hint) and hint.__module__.startswith("jaxprt"):
